@@ -153,6 +153,8 @@ def test_guide_can_be_followed_to_its_end(name: str, shell: PageShell) -> None:
         elif language == "sh":
             for command in commands(code):
                 status, answer = shell.run("bash", "-c", with_own_name(command, shell.own))
+                if "no picture: " in answer:
+                    continue  # without a graphics driver
                 printed += answer
                 expected = re.search(r"# exit status (\d)", command)
                 other = shell.log.read_text()[-2000:] if shell.background else ""

@@ -41,7 +41,7 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
     ]
     assert rows[1]["first_s"] == 0.1
     text = (folder / "report.md").read_text()
-    assert "| counter | saw, then slow | 5          | 25     |" in text
+    assert "| counter | saw   | 3   | count up   | 10     |" in text
     assert str(folder.parent / "slow.toml") in Recording(folder).config
 
 

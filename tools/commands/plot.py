@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
-from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,7 +17,7 @@ from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.pictures import check_picture_path
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.signals import SignalHistory
-from rack.tools.plots.curves import Plot, Series
+from rack.tools.plots.curves import Plot, Series, read_series
 from rack.tools.plots.marks import Mark, list_marks
 from rack.tools.plots.terminal import NO_CURVES, draw_plot
 from rack.tools.recording.divergence import find_other_run, find_tick_range
@@ -57,7 +56,7 @@ def plot(
 
     A signal is a field of a mailbox (the tables in RUN/signals have a column for each field), or
     one number of a field. Signals of the same unit share a panel. Faults, detections, missed
-    cycles, holds, lost boards and restarts are marked, and with --against the first difference.
+    cycles, holds, lost boards and restarts are marked.
 
     Of a running rack the recording so far is plotted. With --when the command waits until the
     condition holds there.
@@ -128,17 +127,17 @@ def _build_plot(
         Failure: The run cannot be read, a name is unknown, or the window is empty.
     """
     recording = Recording(run)
-    name = "" if against is None else Path(title).name
-    all_series = _read_signals(recording, signals, name)
+    other = None if against is None else find_other_run(run, against)
+    # Runs in folders of the same name are named by their paths.
+    name, other_name = Path(title).name, other.name if other else ""
+    if name == other_name:
+        name, other_name = title, str(other)
+    all_series = _read_signals(recording, signals, name if other else "")
     marks = list_marks(recording)
     tick_s = recording.layout.clock_ns * 1e-9
     begins_s, ends_s = (round(tick * tick_s, 9) for tick in find_tick_range(recording))
-    if against is not None:
-        other = find_other_run(run, against)
-        others = _read_signals(Recording(other), signals, other.name)
-        pairs = zip(all_series, others, strict=True)
-        differences = [mark for here, there in pairs for mark in here.find_difference(there)]
-        marks += sorted(differences)[:1]
+    if other is not None:
+        others = _read_signals(Recording(other), signals, other_name)
         all_series += others
         ends_s = max(ends_s, *(float(series.time_s[-1]) for series in others))
     from_s = begins_s if window[0] is None else window[0]
@@ -148,7 +147,7 @@ def _build_plot(
         raise Failure(f"--from {from_s:g} --to {to_s:g}: must be {span}", 2)
     if when is not None:
         trigger = Trigger.parse(when, recording.layout.mailboxes)
-        watched = Series.read(recording, trigger.signal)
+        (watched,) = read_series(recording, trigger.signal)
         held = watched.time_s[trigger.evaluate_values(watched.values)]
         held_s = next(iter(held[(held >= from_s) & (held <= to_s)].tolist()), None)
         if held_s is None:
@@ -156,7 +155,7 @@ def _build_plot(
         marks.append(Mark(held_s, "trigger", when, held_s))
         from_s, to_s = max(held_s - BEFORE_S, begins_s), min(held_s + AFTER_S, ends_s)
     cut = [series.cut(from_s, to_s) for series in all_series]
-    if missing := [series.signal.name for series in cut if not len(series.time_s)]:
+    if missing := [series.name for series in cut if not len(series.time_s)]:
         raise Failure(f"{missing[0]}: no message until {to_s:g} s", 2)
     shown = [mark for mark in marks if mark.time_s <= to_s and mark.until_s >= from_s]
     return Plot(title, cut, sorted(shown), (from_s, to_s))
@@ -164,12 +163,14 @@ def _build_plot(
 
 def _read_signals(recording: Recording, names: list[str], run: str) -> list[Series]:
     """Return the signals of a run. Raises `Failure`, also if one has too many numbers."""
-    signals = [Signal.parse(name, recording.layout.mailboxes) for name in names]
-    for signal in signals:
-        if (count := prod(signal.shape[len(signal.index) :])) > MAX_CURVES:
+    all_series: list[Series] = []
+    for name in names:
+        series = read_series(recording, Signal.parse(name, recording.layout.mailboxes), run)
+        if len(series) > MAX_CURVES:
             raise Failure(
-                f"{signal.name}: has {count} numbers, too many to plot; choose some, as in"
-                f" {signal.name}[0]",
+                f"{name}: has {len(series)} numbers, too many to plot; choose some, as in"
+                f" {name}[0]",
                 2,
             )
-    return [Series.read(recording, signal, run) for signal in signals]
+        all_series += series
+    return all_series

@@ -34,17 +34,18 @@ OnlyRack = Annotated[
 def status(
     rack: OnlyRack = None,
     graph: Path | None = option(
-        "--graph FILE", "draw boards, mailboxes and function blocks, FILE.png or FILE.svg"
+        "--graph FILE", "draw function blocks and their wires, FILE.png or FILE.svg"
     ),
     as_json: Json = False,
 ) -> None:
     """Show a running rack once: every task, its faults, what holds it, and its progress.
 
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
-    time, its reason, and the command that releases it. --graph draws a picture instead: who reads
-    what from whom, at which rates, and how function blocks are wired at present.
+    time, its reason, and the command that releases it. --graph draws a picture instead: how the
+    function blocks of the rack are wired at present.
 
-    Exit status: 0 shown; 1 there is no such rack; 2 RACK is missing and several racks are running.
+    Exit status: 0 shown; 1 there is no such rack; 2 RACK is missing and several racks are running,
+    or RACK has no function blocks.
 
     \b
     Examples:

@@ -14,7 +14,7 @@ import numpy as np
 from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
-from rack.tools.plots.curves import Plot, Series
+from rack.tools.plots.curves import Plot, Series, split_values
 from rack.tools.plots.terminal import draw_plot
 from rack.tools.recording.signal import Signal
 
@@ -96,12 +96,13 @@ class SignalHistory:
 
     def build_series(self, first: int, last: int) -> list[Series]:
         """Return the values of the signals in a range of ticks. Texts are left out."""
-        return [
-            Series(signal, rows["tick"] * self.tick_s, signal.extract_values(rows["message"]))
-            for signal in self.signals
-            if not signal.is_text
-            for rows in [self._select_rows(signal, first, last)]
-        ]
+        all_series = []
+        for signal in self.signals:
+            if not signal.is_text:
+                rows = self._select_rows(signal, first, last)
+                values = signal.extract_values(rows["message"])
+                all_series += split_values(signal, rows["tick"] * self.tick_s, values)
+        return all_series
 
     def to_time_s(self, tick: int) -> float:
         """Convert a tick to simulated time in s."""

@@ -23,7 +23,6 @@ MARK_COLOURS = {
     "hold": "#DDAA33",
     "lost": "#000000",
     "restart": "#009988",
-    "first difference": "#0077BB",
     "trigger": "#33BBEE",
 }
 
@@ -42,16 +41,18 @@ def draw_panel(
     Returns:
         Entries of the marks for a legend.
     """
-    for curves, style in zip(panel.runs, ("-", "--"), strict=False):
+    colours: dict[str, str] = {}
+    first, *_ = panel.curves.values()
+    for label, series in panel.curves.items():
         # Equal signals of both runs have equal colours.
-        for number, (label, time_s, values) in enumerate(curves):
-            axes.step(
-                np.append(time_s, end_s),
-                np.append(values, values[-1:]),
-                f"C{number}{style}",
-                where="post",
-                label=label,
-            )
+        colour = colours.setdefault(series.name, f"C{len(colours)}")
+        axes.step(
+            np.append(series.time_s, end_s),
+            np.append(series.values, series.values[-1:]),
+            colour + ("-" if series.run == first.run else "--"),
+            where="post",
+            label=label,
+        )
     axes.set_ylabel(panel.label)
     if panel.states:
         names, numbers = zip(*panel.states, strict=True)

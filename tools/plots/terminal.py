@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rack.tools.plots.curves import Plot, build_panels
+from rack.tools.plots.curves import Plot, Series, build_panels
 from rack.tools.plots.marks import group_marks
 
 if TYPE_CHECKING:
@@ -51,11 +51,11 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
         plotext.plotsize(console.width, max(rows // len(panels) - 2, MIN_HEIGHT))
         legend = Text()
         lows = []
-        curves = [curve for curves in panel.runs for curve in curves]
-        for number, (label, time_s, values) in enumerate(curves):
-            marker = "braille" if has_colours or len(curves) == 1 else MARKERS[number % 36]
+        for number, (label, series) in enumerate(panel.curves.items()):
+            is_clear = has_colours or len(panel.curves) == 1
+            marker = "braille" if is_clear else MARKERS[number % len(MARKERS)]
             colour = COLOURS[number % len(COLOURS)]
-            points = _list_points(time_s, values, plot.window_s, console.width)
+            points = _list_points(series, plot.window_s, console.width)
             lows += points[1]
             plotext.plot(*points, marker=marker, color=colour if has_colours else None)
             sign = "⠤⠤" if marker == "braille" else marker
@@ -73,19 +73,19 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
                     plotext.vline(ends[0])
         plotext.xlim(*plot.window_s)
         pieces += [Text(panel.label), Text.from_ansi(plotext.build().rstrip("\n"))]
-        pieces += [legend] * (len(curves) > 1)
+        pieces += [legend] * (len(panel.curves) > 1)
     pieces.append(Text("simulated time, s".rjust(console.width)))
     return Text("\n").join([*pieces, *(Text(f"{letter} {entry}") for letter, (entry, _) in groups)])
 
 
 def _list_points(
-    times_s: np.ndarray, values: np.ndarray, window_s: tuple[float, float], width: int
+    series: Series, window_s: tuple[float, float], width: int
 ) -> tuple[list[float], list[float]]:
     """Return the points of a curve in a window: its steps, reduced to what the width can show."""
-    is_finite = np.isfinite(values)
+    is_finite = np.isfinite(series.values)
     # A value holds until the next one.
-    times = np.repeat(np.append(times_s[is_finite].clip(*window_s), window_s[1]), 2)[1:-1]
-    numbers = np.repeat(values[is_finite].astype(float), 2)
+    times = np.repeat(np.append(series.time_s[is_finite].clip(*window_s), window_s[1]), 2)[1:-1]
+    numbers = np.repeat(series.values[is_finite].astype(float), 2)
     if (size := len(times) // (4 * width)) > 1:
         buckets = numbers[: len(numbers) // size * size].reshape(-1, size)
         numbers = np.column_stack((buckets.min(axis=1), buckets.max(axis=1))).ravel()

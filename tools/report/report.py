@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, resolve_layout
+from rack.boards.exchange import AGE_SUFFIX, EXCHANGE_PORT
 from rack.boards.timing.trace_times import (
     compute_distribution,
     compute_plan_ages,
@@ -39,7 +40,6 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import analyze_stalls
 from rack.tools.report import arm_outcome
-from rack.tools.report.data_ages import summarize_data_ages
 from rack.tools.report.miss_causes import add_causes
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.run_report import RunReport
@@ -241,14 +241,39 @@ def _summarize_entries(recording: Recording) -> list[Document]:
     for mailbox, entry, source in list_entries(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
             ages = recording.read_signal(mailbox, f"{entry}.age")
-            counts = {
-                name: _read_last_count(recording, mailbox, f"{entry}.{name}")
-                for name in ENTRY_COUNTS
-            }
+            counts = _read_last_counts(recording, mailbox, entry, ENTRY_COUNTS)
             name = f"{mailbox.partition('.')[0]}.{entry}"
             ages_ms = compute_distribution(ages[ages >= 0] * tick_ms)
             entries.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
     return entries
+
+
+def summarize_data_ages(recording: Recording) -> list[Document]:
+    """Return the ages in ms of the messages at each input of the boards with an exchange record.
+
+    An age counts from the release of the writer's cycle to that of the cycle that takes the
+    message. `jitter` is the difference of the largest and the smallest age.
+    """
+    inputs = []
+    for box in recording.layout.mailboxes:
+        board, _, port = box.name.partition(".")
+        if port != EXCHANGE_PORT:
+            continue
+        ticks = recording.read_signal(box.name, "tick")
+        # Ages and arrivals alternate.
+        for age, taken in zip(box.fields[::2], box.fields[1::2], strict=True):
+            is_new = recording.read_signal(box.name, taken.name) == ticks
+            ages = recording.read_signal(box.name, age.name)[is_new] * recording.layout.clock_ns
+            if ages_ms := compute_distribution(ages * 1e-6):
+                inputs.append(
+                    {
+                        "entry": f"{board}.{age.name.removesuffix(f'_{AGE_SUFFIX}')}",
+                        "taken": len(ages),
+                        "jitter": ages_ms["max"] - ages_ms["min"],
+                        "age_ms": ages_ms,
+                    }
+                )
+    return inputs
 
 
 def summarize_network(recording: Recording) -> Document | None:
@@ -264,9 +289,7 @@ def summarize_network(recording: Recording) -> Document | None:
     imports = []
     for port, source in exchange.imports.items():
         ages_s = recording.read_signal(STATUS, f"import_{port}.age_s")
-        counts = {
-            name: _read_last_count(recording, STATUS, f"import_{port}.{name}") for name in COUNTS
-        }
+        counts = _read_last_counts(recording, STATUS, f"import_{port}", COUNTS)
         # The age is recorded in every cycle of the adapter, and grows until the next message
         # arrives.
         ages = compute_distribution(ages_s[ages_s >= 0.0] * 1e3)
@@ -275,7 +298,7 @@ def summarize_network(recording: Recording) -> Document | None:
         {
             "entry": f"{ADAPTER}.{port}",
             "source": source,
-            "sent": _read_last_count(recording, STATUS, f"export_{port}.sent"),
+            **_read_last_counts(recording, STATUS, f"export_{port}", ("sent",)),
         }
         for port, source in exchange.exports.items()
     ]
@@ -291,12 +314,14 @@ def _summarize_peer(recording: Recording, rack: str) -> Document:
     return {
         "peer": rack,
         "state": Presence(int(presence[-1])).name.lower(),
-        "losses": _read_last_count(recording, mailbox, "losses"),
-        "restarts": max(0, _read_last_count(recording, mailbox, "launches") - 1),
+        "losses": int(recording.read_signal(mailbox, "losses")[-1]),
+        "restarts": max(0, int(recording.read_signal(mailbox, "launches")[-1]) - 1),
         "lost_s": round(float((presence == Presence.LOST).sum() * cycle_s), 6),
     }
 
 
-def _read_last_count(recording: Recording, mailbox: str, count: str) -> int:
-    """Return a count from the last recorded message of a mailbox."""
-    return int(recording.read_signal(mailbox, count)[-1])
+def _read_last_counts(
+    recording: Recording, mailbox: str, group: str, names: Iterable[str]
+) -> dict[str, int]:
+    """Return counts of a group of fields from the last recorded message of a mailbox."""
+    return {name: int(recording.read_signal(mailbox, f"{group}.{name}")[-1]) for name in names}

@@ -29,19 +29,14 @@ SKY_COLOUR = (128, 143, 158)
 NO_PICTURE = "no picture: it needs OpenGL (EGL); on Debian: libegl1 libgl1-mesa-dri"
 
 
-def draw_arm(cell: Cell, path: Path, data: mujoco.MjData | None = None) -> str:
-    """Draw the arm of a cell to a PNG file.
-
-    Args:
-        cell: The cell.
-        path: The file.
-        data: State of the cell. None for the arm at home.
+def draw_arm(cell: Cell, path: Path) -> str:
+    """Draw the arm of a cell, at home, to a PNG file.
 
     Returns:
         The path as text, or `NO_PICTURE` without OpenGL.
     """
     model = copy(cell.model)
-    data = data or cell.build_start_data()
+    data = cell.build_start_data()
     model.vis.global_.offwidth = WIDTH
     model.vis.global_.offheight = HEIGHT
     model.vis.headlight.ambient = [0.35, 0.35, 0.35]

@@ -66,7 +66,10 @@ class LaunchedRack(CrateRack):
         super().__init__(config, self._handle_event)
         self.folder = None if out is None else choose_run_folder(Path(out), config.name)
         self._on_event = on_event
-        self._record: RunRecord | None = None
+        self._log = EventLog(Display())
+        self._recorder: RecorderProcess | None = None
+        self._standstill: StandstillDetector | None = None
+        self._began_s = 0.0
 
     def __repr__(self) -> str:
         end = "not over" if self.outcome is None else self.outcome.cause
@@ -75,8 +78,8 @@ class LaunchedRack(CrateRack):
 
     def _handle_event(self, event: Event) -> None:
         """Log an event, and pass it to the program's handler."""
-        if self._record is not None:
-            self._record.log.add_event(event)
+        if self.folder is not None:
+            self._log.add_event(event)
         if self._on_event is not None:
             self._on_event(event)
 
@@ -85,15 +88,21 @@ class LaunchedRack(CrateRack):
 
         Raises the errors of `rack.boards.Rack.launch`, and `Failure` if `out` cannot be written.
         """
-        if self.folder is not None:
-            self._record = RunRecord(self.folder)
+        if self.folder is None:
+            super().launch()
+            return
+        # The recorder imports its libraries while the boards start.
+        recorder = self._recorder = RecorderProcess(self.folder)
         super().launch()
-        if self._record is not None:
-            try:
-                self._record.attach_recorder(self)
-            except BaseException:
-                self.close()
-                raise
+        try:
+            create_run_folder(self.folder, self.config, self._log)
+            if not recorder.attach(self.config.name, None, self.segment.words):
+                self._log_text(NO_RECORDER)
+            self._standstill = StandstillDetector(self.segment)
+            self._began_s = time.monotonic()
+        except BaseException:
+            self.close()
+            raise
 
     def watch(self, timeout_s: float) -> bool:
         """Supervise the boards for `timeout_s`, or until the run is over.
@@ -105,70 +114,34 @@ class LaunchedRack(CrateRack):
             Failure: The recording cannot be written.
         """
         is_running = super().watch(timeout_s)
-        if self._record is not None:
-            self._record.log_news()
+        if self._recorder is not None and self._standstill is not None:
+            for text in self._recorder.read_notices():
+                self._log_text(text)
+            for event in self._standstill.list_events():
+                self._log.add_event(event)
         return is_running
 
     def close(self) -> None:
         """End all processes of the rack, remove its segment, and finish the recording."""
-        record = self._record
-        if record is not None and self.outcome is not None:
-            record.await_recorder()
+        recorder, folder = self._recorder, self.folder
+        if recorder is not None and self.outcome is not None:
+            # Wait until the recorder is attached, because it cannot attach to a closed rack.
+            recorder.wait_until_attached()
         super().close()
-        self._record = None
-        if record is not None:
-            record.finish_files(self)
+        self._recorder = None
+        if recorder is not None and folder is not None:
+            wall_s = time.monotonic() - self._began_s
+            with closing(self._log):
+                why = recorder.finish()
+                if (outcome := self.outcome) is not None:
+                    comparison = compare_recording(folder, self.segment, why, outcome.ticks)
+                    result = build_result(self.segment, self.config, outcome, wall_s, *comparison)
+                    self._log.write_outcome(asdict(result))
+
+    def _log_text(self, text: str) -> None:
+        """Log a message of the recorder as an event."""
+        self._log.add_event(Event(time.time_ns(), -1, "recorder", "", text))
 
 
 Rack = LaunchedRack
 """The name of the class in the package `rack`."""
-
-
-class RunRecord:
-    """The recording of a run: its events, and the recorder's process.
-
-    The process imports its libraries while the boards start.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._recorder = RecorderProcess(folder)
-        self._standstill: StandstillDetector | None = None
-        self._began_s = 0.0
-        self.log = EventLog(Display())
-
-    def attach_recorder(self, rack: LaunchedRack) -> None:
-        """Record a rack that has been launched. Raises `Failure`."""
-        create_run_folder(self._folder, rack.config, self.log)
-        if not self._recorder.attach(rack.config.name, None, rack.segment.words):
-            self._log_text(NO_RECORDER)
-        self._standstill = StandstillDetector(rack.segment)
-        self._began_s = time.monotonic()
-
-    def log_news(self) -> None:
-        """Log new messages of the recorder, and the events of the standstill detector.
-
-        Raises `Failure` if the recorder cannot write.
-        """
-        for text in self._recorder.read_notices():
-            self._log_text(text)
-        for event in () if self._standstill is None else self._standstill.list_events():
-            self.log.add_event(event)
-
-    def await_recorder(self) -> None:
-        """Wait until the recorder is attached, because it cannot attach to a closed rack."""
-        self._recorder.wait_until_attached()
-
-    def finish_files(self, rack: LaunchedRack) -> None:
-        """Finish the files of a closed rack, with its outcome if the run is over."""
-        wall_s = time.monotonic() - self._began_s
-        with closing(self.log):
-            why = self._recorder.finish()
-            if rack.outcome is not None:
-                comparison = compare_recording(self._folder, rack.segment, why, rack.outcome.ticks)
-                result = build_result(rack.segment, rack.config, rack.outcome, wall_s, *comparison)
-                self.log.write_outcome(asdict(result))
-
-    def _log_text(self, text: str) -> None:
-        """Log a message of the recorder as an event."""
-        self.log.add_event(Event(time.time_ns(), -1, "recorder", "", text))

@@ -13,7 +13,7 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.launch.continued import parse_tick
-from rack.tools.plots.curves import Series, build_panels, format_index, require_number
+from rack.tools.plots.curves import build_panels, format_index, split_values
 from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_marks
 from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
@@ -148,7 +148,7 @@ class RecordedSignal:
         Raises:
             Failure: The signal is a text, or matplotlib is missing.
         """
-        require_number(self.signal)
+        all_series = split_values(self.signal, self.time_s, self.values)
         if not can_draw():
             raise Failure(NO_PICTURES)
         from matplotlib import pyplot
@@ -156,7 +156,7 @@ class RecordedSignal:
         from rack.tools.plots.figure import draw_panel
 
         axes = axes or pyplot.figure(layout="constrained").add_subplot()
-        (panel,) = build_panels([Series(self.signal, self.time_s, self.values)])
+        (panel,) = build_panels(all_series)
         end_s = max(self.time_s, default=0.0)
         marks = draw_panel(axes, panel, group_marks(list_marks(self._recording)), end_s)
         axes.set_xlabel("simulated time, s")

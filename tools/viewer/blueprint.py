@@ -9,10 +9,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.components import PlayState
-from rerun.encodings import EntityPathLike
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import Message, Status
+from rack.backplane.message import Status
 from rack.boards.config import RackConfig, build_rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
@@ -24,37 +23,30 @@ from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find
 from rack.tools.viewer.curves import (
     BY_FINGER,
     ERROR,
-    GRIP,
     GRIPPER,
     HAND,
     JOINTS,
-    OPENING,
+    NOT_AS_CURVES,
     QUANTITIES,
     SIGNALS,
     TENSIONS,
     TIPS,
-    find_gripper_units,
     get_plotted_unit,
     has_curves,
 )
-from rack.tools.viewer.events import EVENTS, RACK_LANE, RECORDER
-from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
+from rack.tools.viewer.events import EVENTS, RACK_LANE
+from rack.tools.viewer.forces import AXES, CONTACT_UNITS, FORCES
 from rack.tools.viewer.levels import (
-    COLUMN,
     HIERARCHY,
     LEVELS,
-    ROW,
-    compute_positions,
     list_value_lanes,
     name_lanes,
 )
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
-from rack.tools.viewer.style import GRID, LEGEND, LEGEND_LETTER, LEGEND_ROW, build_lanes_view
-from rack.tools.viewer.timing import BOARDS, MISSED
+from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view
+from rack.tools.viewer.timing import BOARDS
 
 CONFIG = "config"
-DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
-"""Style of the curves of the first run in a comparison of two runs."""
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 MAX_LANES = 9
 """Largest number of lanes below each other, so that none is cut off on a screen of 1080 lines."""
@@ -62,7 +54,6 @@ MAX_GRID = 4
 """Largest number of plots of signals that are shown side by side. More are shown as tabs."""
 STATUS_FIELDS = [field.name for field in Status.message_type.fields]
 """Fields of every status, which are shown as lanes and log lines."""
-ERROR_TITLE = "tracking error, mrad"
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
 """Time shown before and after the cursor in the lanes of cycles: several cycles of most boards."""
@@ -99,67 +90,22 @@ def build_blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
     )
 
 
-def build_common_view(racks: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of several racks that ran together.
+def build_common_view(racks: Mapping[str, RackViews], what: str) -> rrb.Container:
+    """Return the view of several racks that ran together, or of two runs of one rack.
 
-    The first tab shows all racks above a common log. Each further tab shows one rack.
-
-    Args:
-        racks: Dictionary from the name of each rack to its views.
-    """
-    return _build_tabs(racks, "all racks", _build_common_log(racks, "racks"), [4, 1])
-
-
-def build_comparison_view(runs: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view that compares two runs of the same rack.
-
-    The first tab shows both runs, and plots with the curves of both. The curves of the first run
-    are grey. Each further tab shows one run.
+    The first tab shows all of them side by side above a common log. Each further tab shows one.
 
     Args:
-        runs: Dictionary from the name of each run to its views.
-    """
-    first, other = (views.list_main_curves() for views in runs.values())
-    names = "{} in grey, {} in colour".format(*runs)
-    plots = [
-        _build_plot(f"{title}: {names}", grey + other[title], False, dict.fromkeys(grey, DIMMED))
-        for title, grey in first.items()
-    ]
-    below = rrb.Horizontal(
-        _build_common_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5]
-    )
-    return _build_tabs(runs, "both runs", below, [5, 3])
-
-
-def _build_tabs(
-    racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
-) -> rrb.Container:
-    """Return a tab with all racks side by side, and further tabs with one rack each.
-
-    Args:
-        racks: Dictionary from the name of each rack to its views.
-        name: Title of the first tab.
-        below: View below the racks in the first tab.
-        shares: Relative heights of the racks and of the view below them.
-    """
-    columns = rrb.Horizontal(*(views.build_column(rack) for rack, views in racks.items()))
-    first_tab = rrb.Vertical(columns, below, row_shares=shares, name=name)
-    return rrb.Tabs(
-        first_tab, *(views.build_all_views(rack) for rack, views in racks.items()), active_tab=0
-    )
-
-
-def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
-    """Return a view with the log lines of all racks.
-
-    Args:
-        racks: Dictionary from the name of each rack to its views.
-        what: Word for the racks in the title, "racks" or "runs".
+        racks: Dictionary from the name of each rack or run to its views.
+        what: Word for them in titles, "racks" or "runs".
     """
     logs = [f"{build_path(LOG)}/**", *(views.build_query(LOG) for views in racks.values())]
-    return rrb.TextLogView(
-        origin="/", contents=logs, name=f"log of all {what}", columns=LOG_COLUMNS
-    )
+    title = f"log of all {what}"
+    log = rrb.TextLogView(origin="/", contents=logs, name=title, columns=LOG_COLUMNS)
+    columns = rrb.Horizontal(*(views.build_column(rack) for rack, views in racks.items()))
+    first_tab = rrb.Vertical(columns, log, row_shares=[4, 1], name=f"all {what}")
+    tabs = (views.build_all_views(rack) for rack, views in racks.items())
+    return rrb.Tabs(first_tab, *tabs, active_tab=0)
 
 
 class RackViews:
@@ -218,30 +164,15 @@ class RackViews:
                 self._build_load_plots(),
                 self._build_age_plots(),
                 self._build_legend(timing.LOAD, "tasks", self._boards),
-                self._build_log_tabs(),
+                rrb.Tabs(
+                    rrb.TextLogView(origin=self.build_path(LOG), name="log", columns=LOG_COLUMNS),
+                    rrb.TextDocumentView(origin=self.build_path(CONFIG), name="config"),
+                ),
                 column_shares=[4, 4, 2, 8],
             ),
             row_shares=[4, 5, 3],
         )
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
-
-    def list_main_curves(self) -> dict[str, list[str]]:
-        """Return a dictionary from the title of each main plot to the entities of its curves.
-
-        The main plots are shown when two runs are compared. They contain tracking error, position,
-        velocity and torque of the arm or, without an arm, all fields of all messages.
-        """
-        if not self._joints:
-            boxes = self._layout.mailboxes
-            fields = [(box.name, field.name) for box in boxes for field in box.fields]
-            return {"signals": [self.build_path(SIGNALS, *names) for names in fields]}
-        by_quantity = {
-            f"{quantity}, {unit}": [
-                self.build_path(JOINTS, name, quantity) for name in self._joints
-            ]
-            for quantity, unit in QUANTITIES.items()
-        }
-        return {ERROR_TITLE: [self.build_path(ERROR)], **by_quantity}
 
     def build_column(self, name: str) -> rrb.Container | rrb.View:
         """Return a column for a view of several racks: the cell, if any, above the level lanes."""
@@ -260,15 +191,11 @@ class RackViews:
             lanes.append(([self.build_query(LEVELS, self._names.get(board, board))], count))
         return _build_lane_columns(name, lanes)
 
-    def _build_event_lanes(self) -> rrb.Container:
-        """Return views of the events and of the missed cycles of all tasks in the whole run."""
-        names = [*self._names.values()]
-        events = [*names, *self._config.host, "clock", RACK_LANE]
-        columns = [
-            _build_lane_columns(title, [([self.build_path(group, name)], 1) for name in shown])
-            for title, group, shown in (("events", EVENTS, events), ("missed", MISSED, names))
-        ]
-        return rrb.Horizontal(*columns, name="events and missed cycles")
+    def _build_event_lanes(self) -> rrb.Container | rrb.View:
+        """Return views of the events of all boards in the whole run."""
+        names = (*self._names.values(), *self._config.host, "clock", RACK_LANE)
+        lanes = [([self.build_path(EVENTS, name)], 1) for name in names]
+        return _build_lane_columns("events", lanes)
 
     def _build_cycle_lanes(self) -> rrb.Container | rrb.View:
         """Return views of the cycles of all tasks around the time cursor."""
@@ -305,10 +232,11 @@ class RackViews:
         Each quantity has one plot with all joints and, in a second tab, one plot per joint with
         limits. Own signals, requests, forces, tracking error and gripper follow in further tabs.
         """
-        curves = self.list_main_curves()
         views = [
             rrb.Tabs(
-                _build_plot(f"{quantity}, {unit}", curves[f"{quantity}, {unit}"]),
+                self._plot(
+                    f"{quantity}, {unit}", *((JOINTS, name, quantity) for name in self._joints)
+                ),
                 rrb.Grid(
                     *(
                         self._plot(
@@ -345,17 +273,17 @@ class RackViews:
                     name="queue and moving goal",
                 )
         if cell.wrist is not None:
-            yield self._plot("force along z, wanted and exerted, N", (FORCES, TASK, "z"))
+            yield self._plot("force along z, wanted and exerted, N", (FORCES, "z"))
             for what, unit in CONTACT_UNITS.items():
-                axes = [(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit]
+                axes = [(FORCES, axis) for axis in AXES if AXES[axis] == unit]
                 yield self._plot(f"{what} wanted and exerted, {unit}", *axes)
-            for what, unit in CONTACT_UNITS.items():
-                title = f"contact: {what}, with its limit, {unit}"
-                yield self._plot(title, (FORCES, CONTACT, what))
-        yield self._plot(ERROR_TITLE, (ERROR,))
+        yield self._plot("tracking error, mrad", (ERROR,))
         if cell.gripper is not None:
-            for name, unit in zip((OPENING, GRIP), find_gripper_units(cell), strict=True):
-                yield self._plot(f"gripper's {name}, {unit}", (GRIPPER, name))
+            for box in self._layout.mailboxes:
+                for field in box.fields:
+                    if box.message in DRIVING and field.name in GRIPPER:
+                        title = f"{field.name}, {field.unit}"
+                        yield self._plot(title, (SIGNALS, box.name, field.name))
 
     def _plot(self, title: str, *entities: tuple[str, ...]) -> rrb.View:
         """Return a plot of the curves of some entities of this rack."""
@@ -363,11 +291,7 @@ class RackViews:
 
     def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
         """Return a view, with a title, of the legend `what` that `write_legend` wrote."""
-        half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
-        rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
-        bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
-        origin = self.build_path(LEGEND, what)
-        return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
+        return rrb.GraphView(origin=self.build_path(LEGEND, what), name=name)
 
     def _build_finger_plots(self, hand: Hand) -> rrb.Container:
         """Return the plots of a hand.
@@ -397,21 +321,12 @@ class RackViews:
         )
 
     def _list_own_mailboxes(self) -> list[MailboxSpec]:
-        """Return the mailboxes of the user's levels whose messages this package does not know."""
+        """Return the mailboxes of the user's levels that are shown as signals."""
         own = {
             task.name for task in self._config.list_tasks() if not task.target.startswith("rack.")
         }
-        classes: list[type[Message]] = [Message]
-        for message in classes:
-            classes += message.__subclasses__()  # the loop continues with them
-        known = {
-            message.message_type.name
-            for message in classes
-            if message.__module__.startswith("rack.")
-        }
-        return [
-            box for box in self._layout.mailboxes if box.writer in own and box.message not in known
-        ]
+        boxes = self._layout.mailboxes
+        return [box for box in boxes if box.writer in own and box.message not in NOT_AS_CURVES]
 
     def _build_unit_plots(
         self, name: str, mailboxes: Sequence[MailboxSpec]
@@ -460,25 +375,9 @@ class RackViews:
             self._build_unit_plots("signals", self._layout.mailboxes),
         )
 
-    def _build_log_tabs(self) -> rrb.Container:
-        """Return tabs with the log, the config, and the recorder's load and losses."""
-        log = rrb.TextLogView(origin=self.build_path(LOG), name="log", columns=LOG_COLUMNS)
-        config = rrb.TextDocumentView(origin=self.build_path(CONFIG), name="config")
-        load = self._plot("recorder, % of a core", (RECORDER, "load"))
-        lost = self._plot("rows lost", (RECORDER, "rows_lost"))
-        return rrb.Tabs(log, config, load, lost)
-
     def _build_graph(self) -> rrb.View:
         """Return the view of the hierarchy of levels as a graph."""
-        places = compute_positions(self._layout, self._timing).values()
-        columns, rows = zip(*places, strict=True)
-        bounds = rrb.VisualBounds2D(
-            x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN),
-            y_range=(min(rows) - ROW, max(rows) + ROW),
-        )
-        return rrb.GraphView(
-            origin=self.build_path(HIERARCHY), name="hierarchy", visual_bounds=bounds
-        )
+        return rrb.GraphView(origin=self.build_path(HIERARCHY), name="hierarchy")
 
 
 def _build_lane_columns(
@@ -509,7 +408,6 @@ def _build_plot(
     name: str,
     contents: list[str],
     legend: bool = False,
-    overrides: Mapping[EntityPathLike, rr.SeriesLines] | None = None,
 ) -> rrb.View:
     """Return a plot of curves.
 
@@ -517,14 +415,12 @@ def _build_plot(
         name: Title of the plot.
         contents: Queries for its entities.
         legend: Whether to show a legend.
-        overrides: Dictionary from entity to the style that replaces the recorded one.
     """
     return rrb.TimeSeriesView(
         contents=contents,
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
-        overrides=overrides,
     )
 
 

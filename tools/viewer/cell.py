@@ -1,4 +1,4 @@
-"""Writes the cell in 3D: geoms, poses of moving bodies, pushes, planned path and goals.
+"""Writes the cell in 3D: geoms, poses of moving bodies, planned path and goals.
 
 The arm is red while its brakes are engaged, and balls mark faults. Each geom is written only once,
 in the frame of its body.
@@ -15,11 +15,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from rack.boards.events import Event
-from rack.levels.algebra import Array, Ints
+from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
-from rack.tools.viewer.forces import list_contacts
 from rack.tools.viewer.levels import format_enum
 from rack.tools.viewer.shapes import (
     Shape,
@@ -35,21 +34,20 @@ from rack.tools.viewer.stream import (
     Stream,
     ViewPart,
     build_change_finder,
-    build_row_sampler,
 )
-from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, pack_colours
+from rack.tools.viewer.style import CURRENT, GOAL, LOST, PLANNED, pack_colours
 
 CELL = "cell"
 COLLISION = "collision"
 FRAMES = "frames"
 WORLD = "world"
+SHOWN_S = 0.02
+"""Simulated time between two drawn poses, about the refresh interval of a screen."""
 SHOWN_GROUPS = 3
 """Number of geom groups that are shown.
 
 MuJoCo's own viewer shows groups 0, 1 and 2. By convention, higher groups contain collision shapes.
 """
-TOOL = (CELL, "tool")
-TOOL_COLOUR = 0xE63CC8FF
 PATH = (CELL, "planned_path")
 WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
@@ -81,23 +79,11 @@ AXES_BESIDE = np.array([-0.6, -0.45, 0.0])
 The axes are left of the arm.
 """
 AXES_COLOURS = (0xE64646FF, 0x46B45AFF, 0x468CE6FF)
-PUSHES = (CELL, "pushes")
-PUSH_M = 0.02
-PUSH_RADIUS_M = 0.0015
-"""Length of a push's arrow per newton, and its radius."""
 
 
 def name_frame(model: mujoco.MjModel, body: int) -> str:
     """Return the name of a body's coordinate frame in the recording."""
     return WORLD if body == 0 else f"body/{model.body(body).name or body}"
-
-
-def find_moving_bodies(model: mujoco.MjModel) -> Ints:
-    """Return the indices of all bodies that can move, shape (n,).
-
-    These are bodies with joints or mocap poses, and all bodies attached to them.
-    """
-    return np.flatnonzero(model.body_weldid)
 
 
 class ArmShape(NamedTuple):
@@ -161,82 +147,44 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
     return arm
 
 
-class PoseWriter:
-    """Writes the poses of all moving bodies, and the tool's positions, from `ArmState` messages.
+def build_pose_part(stream: Stream, cell: Cell) -> ViewPart:
+    """Return the view part that shows the poses of all moving bodies from `ArmState` messages.
 
-    The poses are computed by MuJoCo's kinematics. With `has_pushes`, the forces with which the
-    scene pushes objects are written as arrows.
+    The poses are computed by MuJoCo's kinematics, at most once per 20 ms of simulated time.
     """
+    model = cell.model
+    data = cell.build_start_data()
+    # Bodies with joints or mocap poses, and all bodies attached to them.
+    bodies = np.flatnonzero(model.body_weldid)
+    world = stream.format_frame(WORLD)
+    frames = [stream.format_frame(name_frame(model, body)) for body in bodies.tolist()]
+    every = max(1, round(SHOWN_S * 1e9 / stream.times.clock_ns))
+    last = -1
 
-    def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.build_start_data()
-        self._bodies = find_moving_bodies(cell.model)
-        self._contacts = list_contacts(cell)
-        self._world = stream.format_frame(WORLD)
-        self._frames = [
-            stream.format_frame(name_frame(cell.model, int(body))) for body in self._bodies
-        ]
-        self._frames += [stream.format_frame(contact.frame) for contact in self._contacts]
-        self._sampled_rows = build_row_sampler(stream.times.clock_ns)
-        self._has_pushes = has_pushes
-        self._is_pushed = False
-        stream.log_static(
-            TOOL,
-            rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]),
-            stream.build_frame(WORLD),
-        )
-        if has_pushes:
-            stream.log_static(PUSHES, stream.build_frame(WORLD))
-
-    def write(self, block: RowBlock) -> None:
-        """Write the poses in a block of messages, at most one per 20 ms of simulated time."""
-        chosen = self._sampled_rows(block.ticks)
-        data = self._data
-        bodies = self._bodies
+    def write(block: RowBlock) -> None:
+        """Write the poses in the first row of each interval. Intervals may span blocks."""
+        nonlocal last
+        slots, first = np.unique(block.ticks // every, return_index=True)
+        chosen = first[slots > last]
+        last = int(slots[-1])
         if not len(bodies) or not len(chosen):
             return
-        count = len(self._frames)
-        poses = np.empty((len(chosen), count, 7))
-        tool = np.empty((len(chosen), 3))
+        poses = np.empty((len(chosen), len(bodies), 7))
         for row, state in enumerate(block.messages["state"][chosen]):
-            view_state(self._cell.model, data, state)
-            mujoco.mj_kinematics(self._cell.model, data)
-            poses[row, : len(bodies)] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
-            for index, contact in enumerate(self._contacts, len(bodies)):
-                poses[row, index] = contact.compute_pose(data)
-            tool[row] = data.site_xpos[self._cell.tool]
-            if self._has_pushes:
-                self._write_pushes(block.find_moment(chosen[row]))
-        self._stream.send_columns(
-            TOOL, block.build_time_columns(chosen), rr.Points3D.columns(positions=tool)
-        )
+            view_state(model, data, state)
+            mujoco.mj_kinematics(model, data)
+            poses[row] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
         translations, quaternions = np.split(poses.reshape(-1, 7), [3], axis=1)
         columns = rr.Transform3D.columns(
             translation=translations,
             quaternion=convert_to_xyzw(quaternions),
-            parent_frame=[self._world] * len(translations),
-            child_frame=self._frames * len(chosen),
+            parent_frame=[world] * len(translations),
+            child_frame=frames * len(chosen),
         )
-        self._stream.send_columns(
-            (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), columns
-        )
+        times = block.build_time_columns(np.repeat(chosen, len(bodies)))
+        stream.send_columns((FRAMES,), times, columns)
 
-    def _write_pushes(self, when: Moment) -> None:
-        """Write arrows for the pushes on objects at a moment, or clear them after the last push."""
-        objects = self._cell.bodies
-        forces = self._data.xfrc_applied[objects, :3]
-        pushed = forces.any(axis=1)
-        if self._is_pushed or pushed.any():
-            self._is_pushed = bool(pushed.any())
-            arrows = rr.Arrows3D(
-                origins=self._data.xipos[objects][pushed],
-                vectors=PUSH_M * forces[pushed],
-                radii=PUSH_RADIUS_M,
-                colors=[FORCE],
-            )
-            self._stream.log_at(when, PUSHES, arrows)
+    return write
 
 
 class MarkWriter:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import prod
 
-import mujoco
 import numpy as np
 
-from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.backplane.layout import FieldSpec
 from rack.levels.algebra import Array, Ints
+from rack.levels.messages import ArmState, Scene, WorldState
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
-from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HandStatus
+from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
@@ -25,14 +26,16 @@ from rack.tools.viewer.style import (
     write_legend,
 )
 
+SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
+NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
+"""Message types whose fields are not shown as separate curves."""
 SIGNALS = "signals"
 MAX_CURVES = 16
 """Largest number of curves of a field. Fields with more numbers have no curves."""
 JOINTS = "joints"
 ERROR = "tracking_error"
-GRIPPER = "gripper"
-OPENING = "opening"
-GRIP = "force"
+GRIPPER = ("opening", "grip_force")
+"""Fields of the status of a board that drives an arm with a gripper."""
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
 """Quantities of a joint, and their units. The torque is the torque after the limit gate."""
 FIELDS = {
@@ -49,19 +52,16 @@ BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FINGER_FORCES: "N"}
 TIPS = (HAND, "tip_forces")
 
 
-def build_joint_curves(
-    stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
-) -> Iterator[ViewPart]:
+def build_joint_curves(stream: Stream, names: Sequence[str], cell: Cell) -> Iterator[ViewPart]:
     """Yield the view parts that show the status of the board that drives the arm.
 
-    These are curves of the measured and commanded values of each joint with their limits, of the
-    tracking errors, and of the gripper.
+    These are curves of the measured and commanded values of each joint with their limits, and of
+    the tracking errors.
 
     Args:
         stream: Stream to write to.
         names: Names of the joints.
         cell: Cell of the arm.
-        has_gripper: Whether the status contains the gripper.
     """
     colours = choose_joint_colours(len(names))
     write_legend(stream, JOINTS, names, colours)
@@ -94,20 +94,6 @@ def build_joint_curves(
         labels,
         colours,
     )
-    if cell.gripper is not None and has_gripper:
-        opening, grip = find_gripper_units(cell)
-        yield build_curves(
-            stream,
-            (GRIPPER, OPENING),
-            lambda block: block.messages["opening"] * 1e3,
-            [f"{OPENING}, {opening}"],
-        )
-        yield build_curves(
-            stream,
-            (GRIPPER, GRIP),
-            lambda block: block.messages["grip_force"],
-            [f"{GRIP}, {grip}"],
-        )
 
 
 def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
@@ -126,24 +112,23 @@ def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewP
     )
 
 
-def find_gripper_units(cell: Cell) -> tuple[str, str]:
-    """Return the units of opening and force of a cell's gripper. Call this only if it has one."""
-    assert cell.gripper is not None, "there is a gripper"
-    joint = cell.model.dof_jntid[cell.gripper.dof]
-    is_hinge = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-    return ("mrad", "N m") if is_hinge else ("mm", "N")
-
-
-def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the view parts that show the numeric fields of a mailbox as curves.
+def build_field_curves(
+    stream: Stream, mailbox: str, fields: Iterable[FieldSpec]
+) -> Iterator[ViewPart]:
+    """Yield the view parts that show numeric fields of a mailbox as curves.
 
     This works for any message, so messages of the user's levels need no configuration.
+
+    Args:
+        stream: Stream to write to.
+        mailbox: Name of the mailbox.
+        fields: The fields. Those that are not numeric are left out.
     """
-    for field in filter(has_curves, mailbox.fields):
+    for field in filter(has_curves, fields):
         unit = f", {unit}" if (unit := get_plotted_unit(field)) else ""
         places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
-        names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
-        entity = (SIGNALS, mailbox.name, field.name)
+        names = [f"{mailbox}.{field.name}{place}{unit}" for place in places]
+        entity = (SIGNALS, mailbox, field.name)
 
         def flatten(block: RowBlock, name: str = field.name) -> Array:
             """Return one column for each number, shape (rows, numbers)."""

@@ -1,28 +1,23 @@
-"""Writes a rack's events as log lines and lanes, and the recorder's lost rows and load.
+"""Writes a rack's events as log lines and lanes, and the recorder's lost rows as log lines.
 
 The lane of a board shows the kind of the board's last event, until the next event.
 """
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-
-import numpy as np
-import rerun as rr
 
 from rack.boards.events import Event
 from rack.tools.recording.checksums import parse_checked_line
 from rack.tools.viewer.cell import MarkWriter
 from rack.tools.viewer.stream import Moment, Stream
-from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
+from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
 
 EVENTS = "events"
-RECORDER = "recorder"
 KINDS_WITHOUT_LANE = ("printed", "miss")
-"""Kinds of events without a lane. Misses have a separate lane next to their board's level."""
+"""Kinds of events without a lane. Missed cycles are in the lanes of cycles."""
 CAUSE_ORDER = ("command", "fault", "died", "miss", "detection", "reaction", "recovery")
 """Kinds of events of the same tick, in the order of cause and effect. Other kinds follow."""
 RACK_LANE = "rack"
@@ -137,46 +132,20 @@ def get_cause_order(event: Event) -> tuple[int, int]:
     return event.tick, CAUSE_ORDER.index(event.kind) - len(CAUSE_ORDER) if is_effect else 0
 
 
-def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
-    """Return a function that writes the total number of lost rows, and logs every new loss.
+def build_loss_lines(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
+    """Return a function that logs every new loss of rows.
 
     Its arguments are the tick, and a dictionary from ring to the number of rows that were
     overwritten before the recorder read them.
     """
-    entity = (RECORDER, "rows_lost")
-    style_curves(stream, entity, ["rows lost"], [LOST])
     logged = Counter[str]()
 
     def write(tick: int, lost: Mapping[str, int]) -> None:
-        """Write the total number of lost rows, and log the new losses."""
+        """Log the new losses."""
         nonlocal logged
-        when = stream.times.estimate_moment(tick)
-        counts = Counter(lost)
-        for ring, more in (counts - logged).items():
-            stream.log_line(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
-        logged = counts
-        stream.log_at(when, entity, rr.Scalars(counts.total()))
-
-    return write
-
-
-def build_load_writer(stream: Stream) -> Callable[[int], None]:
-    """Return a function that writes the recorder's mean processor load since the previous call.
-
-    Call the function in the recorder, because it measures the calling process. Its argument is the
-    tick for which the load is written.
-    """
-    entity = (RECORDER, "load")
-    style_curves(stream, entity, ["recorder, % of a core"])
-    last = time.process_time(), time.monotonic()
-
-    def write(tick: int) -> None:
-        """Write the processor load since the last call."""
-        nonlocal last
-        now = time.process_time(), time.monotonic()
-        cpu_s, wall_s = np.subtract(now, last)
-        last = now
-        load = rr.Scalars(100.0 * cpu_s / max(wall_s, 1e-9))
-        stream.log_at(stream.times.estimate_moment(tick), entity, load)
+        for ring, more in (Counter(lost) - logged).items():
+            text = f"recorder: {more} rows of {ring} lost"
+            stream.log_line(stream.times.estimate_moment(tick), "recorder", text, "ERROR")
+        logged = Counter(lost)
 
     return write

@@ -13,7 +13,6 @@ from rack.tools.viewer.blueprint import (
     RackViews,
     build_blueprint,
     build_common_view,
-    build_comparison_view,
 )
 from rack.tools.viewer.sink import RackWriter, RunContext, compute_block_ticks
 from rack.tools.viewer.stream import Moment, Stream, Timelines, open_recording
@@ -46,10 +45,10 @@ def write_merged(
         roots[rack] = (rack,) if len(placed) > 1 else ()
         views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
-    if placed[0].is_tick_aligned:
-        root = build_comparison_view(views)
+    if len(placed) == 1:
+        root = views[name].build_all_views()
     else:
-        root = build_common_view(views) if len(placed) > 1 else views[name].build_all_views()
+        root = build_common_view(views, "runs" if placed[0].is_tick_aligned else "racks")
     launches = "-".join(str(place.grid.launch.created_ns) for place in placed)
     recording = open_recording(name, f"{name}-{launches}", file, build_blueprint(root))
     first = placed[0].grid

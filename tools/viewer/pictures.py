@@ -86,9 +86,7 @@ def draw_picture(recordings: Sequence[Path], at_s: float, view: str | None = Non
         try:
             return pool.submit(_draw, window, port, recordings, at_s, view).result(LONGEST_S)
         except (ConnectionError, RuntimeError, TimeoutError) as error:
-            raise NoViewerError(
-                f"no picture: {_explain_failure(window, error)}; --cell draws the cell without it"
-            ) from None
+            raise NoViewerError(f"no picture: {_explain_failure(window, error)}") from None
 
 
 def _draw(

@@ -52,7 +52,9 @@ def build_shape(model: mujoco.MjModel, geom: int) -> Shape | None:
             begin = transform_to_body(model, geom, np.array([[0.0, 0.0, -half]]))
             return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **solid)
         case Geom.mjGEOM_PLANE:
-            return _build_plane(model, geom)
+            # A half size of zero means an infinite plane. Draw it larger than the model.
+            sides = [half_size or 2 * model.stat.extent for half_size in size[:2]]
+            return rr.Boxes3D(half_sizes=[(*sides, 0.0)], **centred)
         case Geom.mjGEOM_MESH | Geom.mjGEOM_SDF:
             return _build_mesh(model, geom)
         case Geom.mjGEOM_HFIELD:
@@ -70,14 +72,6 @@ def read_colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
 def convert_to_xyzw(quaternions: Array) -> Array:
     """Convert quaternions of shape (..., 4) from MuJoCo's order, w first, to rerun's, w last."""
     return np.roll(quaternions, -1, axis=-1)
-
-
-def _build_plane(model: mujoco.MjModel, geom: int) -> Shape:
-    """Return the shape of a plane, which consists of two triangles."""
-    # A half size of zero means an infinite plane. Draw it larger than the model.
-    x, y = (half_size or 2 * model.stat.extent for half_size in model.geom_size[geom][:2])
-    corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    return _build_surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _build_mesh(model: mujoco.MjModel, geom: int) -> Shape:

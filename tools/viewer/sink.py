@@ -19,27 +19,29 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, build_rack_timing, read_stored
-from rack.levels.messages import ArmState, MovePlan, MoveStatus, Scene, TaskPlan, WorldState
+from rack.levels.messages import ArmState, MovePlan, MoveStatus, TaskPlan
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.systems.force.messages import ForceStatus, Wrench
+from rack.levels.systems.force.messages import ForceStatus
 from rack.levels.systems.hand.messages import HandStatus
-from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
+from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, build_blueprint, write_document
 from rack.tools.viewer.cell import (
     GoalWriter,
     MarkWriter,
-    PoseWriter,
     build_path_part,
+    build_pose_part,
     write_geometry,
 )
-from rack.tools.viewer.curves import build_field_curves, build_hand_curves, build_joint_curves
-from rack.tools.viewer.events import EventWriter, build_load_writer, build_loss_writer
-from rack.tools.viewer.forces import (
-    build_contact_arrows,
-    build_contact_curves,
-    build_task_force_curves,
+from rack.tools.viewer.curves import (
+    GRIPPER,
+    NOT_AS_CURVES,
+    build_field_curves,
+    build_hand_curves,
+    build_joint_curves,
 )
+from rack.tools.viewer.events import EventWriter, build_loss_lines
+from rack.tools.viewer.forces import build_task_force_curves
 from rack.tools.viewer.levels import (
     FIRED,
     LEVELS,
@@ -59,13 +61,10 @@ from rack.tools.viewer.timing import (
     AgeWriter,
     CycleLane,
     build_load_curves,
-    build_miss_lane,
+    build_miss_lines,
     choose_task_colours,
 )
 
-SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
-NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
-"""Message types whose fields are not shown as separate curves."""
 BLOCK_S = 1.0
 """Simulated duration of a block. Writing 4 rows takes as long as writing 400."""
 
@@ -157,7 +156,7 @@ class RackWriter:
                 partial(self._hierarchy.write, task.name),
                 cycles[task.name].write,
                 *build_load_curves(stream, task, colours[task.name], tick_ns, lockstep),
-                build_miss_lane(stream, task, names[task.name]),
+                build_miss_lines(stream, task),
             ]
             for task in layout.tasks
         }
@@ -186,7 +185,7 @@ class RackWriter:
                 marks.mark_lost(when, task)
 
         self._events = EventWriter(stream, ran.events, names, mark_lost, marks)
-        self._write_losses = build_loss_writer(stream)
+        self._write_losses = build_loss_lines(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(
@@ -247,7 +246,6 @@ class ViewSink:
         recording = open_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
-        self._write_load = build_load_writer(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = compute_block_ticks(layout)
         self._written = segment.words[System.TICK]
@@ -271,11 +269,12 @@ class ViewSink:
             RuntimeError: The file cannot be written.
         """
         if tick - self._written >= self._block:
+            # Begin a part only for rows that are written, because no viewer opens an empty file.
+            if self._part_ends is not None and self._written >= self._part_ends:
+                self._part_ends += self._part
+                self._stream.continue_in(find_next_file(self._folder))
             self._write(tick, lost)
             self._stream.flush()
-            if self._part_ends is not None and tick >= self._part_ends:
-                self._part_ends = tick + self._part
-                self._stream.continue_in(find_next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write the remaining rows and finish the file.
@@ -293,14 +292,13 @@ class ViewSink:
         self._stream.close()
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the queued rows as a block that ends at `tick`, and the load of the recorder."""
+        """Write the queued rows as a block that ends at `tick`."""
         self._written = tick
         waiting = self._waiting
         self._waiting = defaultdict(list)
         self._writer.write(
             {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost
         )
-        self._write_load(tick)
 
 
 def compute_block_ticks(layout: Layout) -> int:
@@ -326,7 +324,7 @@ def _build_mailbox_parts(
     if {field.name for field in mailbox.fields}.issuperset(FIRED):
         yield build_fired_lines(stream, mailbox)
     if mailbox.message not in NOT_AS_CURVES:
-        yield from build_field_curves(stream, mailbox)
+        yield from build_field_curves(stream, mailbox.name, mailbox.fields)
 
 
 def _build_arm_parts(
@@ -346,15 +344,14 @@ def _build_arm_parts(
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ArmState.message_type.name:
-            yield PoseWriter(stream, cell, bool(config.scene.push)).write
+            yield build_pose_part(stream, cell)
         case HandStatus.message_type.name if cell.hand is not None:
             yield from build_hand_curves(stream, robot.joints, cell.hand)
-            yield build_contact_arrows(stream, cell, "force")
         case driving if driving in DRIVING:
-            yield from build_joint_curves(stream, robot.joints, cell, robot.gripper is not None)
-        case Wrench.message_type.name if cell.wrist is not None:
-            yield build_contact_arrows(stream, cell, "wrench")
-            yield from build_contact_curves(stream, cell.wrist.contact_limits)
+            yield from build_joint_curves(stream, robot.joints, cell)
+            if robot.gripper is not None:
+                fields = [field for field in mailbox.fields if field.name in GRIPPER]
+                yield from build_field_curves(stream, mailbox.name, fields)
         case ForceStatus.message_type.name:
             yield from build_task_force_curves(stream)
         case MovePlan.message_type.name:

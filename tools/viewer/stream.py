@@ -189,30 +189,6 @@ def build_change_finder() -> Callable[[np.ndarray], Ints]:
     return changed_rows
 
 
-SHOWN_S = 0.02
-"""Simulated time between two drawn rows, about the refresh interval of a screen."""
-
-
-def build_row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
-    """Return a function that chooses the rows to draw: the first in every 20 ms of simulated time.
-
-    Call the function with the ticks of one block after the other. It returns the indices of the
-    chosen rows.
-    """
-    every = max(1, round(SHOWN_S * 1e9 / clock_ns))
-    last = -1
-
-    def sampled_rows(ticks: Ints) -> Ints:
-        """Return the index of the first row of each interval. Intervals may span blocks."""
-        nonlocal last
-        slots, first = np.unique(ticks // every, return_index=True)
-        chosen = first[slots > last]
-        last = int(slots[-1])
-        return np.asarray(chosen)
-
-    return sampled_rows
-
-
 def open_recording(
     name: str, run: str, file: Path | None, blueprint: rrb.Blueprint, port: int | None = None
 ) -> rr.RecordingStream:

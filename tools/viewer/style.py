@@ -32,15 +32,13 @@ LIMIT = 0xC83C3C6E
 PLANNED = 0xFFC828FF
 GOAL = 0x46D25AFF
 CURRENT = 0xFF6E28FF
-FORCE = 0xF03C3CFF
 LOST = 0xE63232FF
 GRID = 0xFFFFFF78
 OVERLAID = (2.5, 1.0)
 """Widths of two curves. Where they coincide, the wider one is visible on both sides."""
 LEGEND = "legend"
 LEGEND_ROW = 30.0
-LEGEND_LETTER = 7.0
-"""Distance between the entries of a legend, and width of a letter, in the units of a graph."""
+"""Distance between the entries of a legend, in the units of a graph."""
 
 _GREY = 0x6E6E78FF
 _BLUE = 0x468CE6FF

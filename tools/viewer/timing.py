@@ -35,8 +35,6 @@ TIMES = "times"
 AGES = "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
 MISSED = "missed"
-SPAN_S = 0.25
-"""Duration of the mark for a missed cycle. The cycle itself would be too narrow to see."""
 
 
 class CycleLane:
@@ -155,40 +153,19 @@ def build_load_curves(
     )
 
 
-def build_miss_lane(stream: Stream, task: TaskSpec, name: str) -> ViewPart:
-    """Return the view part that shows missed cycles as a lane, and as one log line per block.
-
-    The marks in the lane are wide enough to be visible at any zoom. A task without missed cycles
-    has no such lane.
-
-    Args:
-        stream: Stream to write to.
-        task: The task.
-        name: Name of the task in lanes.
-    """
-    lane = (MISSED, name)
-    span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
+def build_miss_lines(stream: Stream, task: TaskSpec) -> ViewPart:
+    """Return the view part that shows the missed cycles of each block as a log line."""
 
     def write(block: RowBlock) -> None:
-        """Write the missed cycles of a block to the lane and to the log."""
+        """Write a log line, unless no cycle was missed."""
         missed = np.flatnonzero(find_missed_cycles(block.rows))
-        if not len(missed):
-            return
-        style_lane(stream, lane, {MISSED: PHASES[MISSED]})
-        ticks = block.ticks[missed]
-        which = f"tick {ticks[0]}"
-        if len(ticks) > 1:
-            which = f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        stream.log_line(
-            block.find_moment(missed[0]), "misses", f"missed: {task.name}: {which}", "WARN"
-        )
-        marked = np.unique(ticks // span)
-        moments = np.union1d(marked, marked + 1)
-        states = np.where(np.isin(moments, marked), MISSED, "")
-        times = stream.times.build_columns(
-            moments * span, stream.times.estimate_stamps(moments * span)
-        )
-        write_spans(stream, lane, times, states.tolist())
+        if len(missed):
+            ticks = block.ticks[missed]
+            which = f"tick {ticks[0]}"
+            if len(ticks) > 1:
+                which = f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
+            text = f"missed: {task.name}: {which}"
+            stream.log_line(block.find_moment(missed[0]), "misses", text, "WARN")
 
     return write
 

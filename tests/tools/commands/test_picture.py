@@ -1,4 +1,4 @@
-"""Tests `rack picture`: the viewer's first view, the cell alone, and what it says if it cannot."""
+"""Tests `rack picture`: the first view, one of its views, and what it says if it cannot."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.shared_runs import nasrem_run, small_run
+from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
 
 NO_DRIVER = {
@@ -42,22 +42,6 @@ def test_the_first_view_and_one_of_its_views_are_drawn(run: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_the_cell_is_drawn_without_the_viewer(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in NO_DRIVER.items():
-        monkeypatch.setenv(name, value)
-    paths = [tmp_path / f"{at}.png" for at in (1, 6)]
-    for at, path in zip((1, 6), paths, strict=True):
-        shown = rack("picture", run, "--at", at, "--cell", "--out", path)
-        if shown.stderr.startswith("no picture: it needs OpenGL"):
-            pytest.skip(shown.stderr)
-        assert (shown.returncode, shown.stdout) == (0, f"picture: {path}\n")
-    # The arm has moved in between.
-    assert paths[0].read_bytes() != paths[1].read_bytes()
-
-
-@pytest.mark.slow
 def test_without_a_driver_the_cause_and_what_to_do_are_one_line(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -68,7 +52,6 @@ def test_without_a_driver_the_cause_and_what_to_do_are_one_line(
     line = shown.stderr.splitlines()[-1]
     assert line.startswith("no picture: ")
     assert "No graphics adapter was found" in line
-    assert line.endswith("; --cell draws the cell without it")
     assert [*tmp_path.iterdir()] == []
 
 
@@ -79,7 +62,6 @@ def test_without_a_driver_the_cause_and_what_to_do_are_one_line(
         (("--at", "nan"), "--at nan: must be 0 to 6.4975 s"),
         (("--at", "1", "--out", "a.jpg"), "--out a.jpg: the name of a picture must end in .png"),
         (("--at", "1", "--out", "nowhere/a.png"), '"nowhere/a.png": No such file or directory'),
-        (("--at", "1", "--cell", "--view", "boards"), "--cell, --view: give one of them"),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(
@@ -87,11 +69,3 @@ def test_bad_arguments_are_refused_in_one_line(
 ) -> None:
     shown = rack("picture", run, *words, folder=tmp_path)
     assert (shown.returncode, shown.stdout, shown.stderr) == (2, "", f"{message}\n")
-
-
-def test_a_rack_without_an_arm_has_no_cell(tmp_path_factory: pytest.TempPathFactory) -> None:
-    run = small_run(tmp_path_factory)
-    shown = rack("picture", run, "--at", 1, "--cell")
-    assert shown.returncode == 2
-    assert shown.stderr.startswith("--cell: rack ")
-    assert not (run / "picture-1s.png").exists()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import asdict
@@ -81,21 +80,18 @@ def test_a_condition_chooses_the_window(run: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_runs_are_compared_and_their_first_difference_is_marked(
+def test_the_curves_of_two_runs_are_plotted_in_one_panel(
     run: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    slow, same = slow_run(tmp_path_factory), tmp_path / "same"
-    shutil.copytree(run, same)
-    found = json.loads(rack("plot", run, COUNT, "--against", same, "--json").stdout)
-    assert [curve["run"] for curve in found["curves"]] == ["run", "same"]
-    assert "first difference" not in {mark["kind"] for mark in found["marks"]}
+    slow = slow_run(tmp_path_factory)
     found = json.loads(rack("plot", run, COUNT, "--against", slow, "--json").stdout)
-    (mark,) = [mark for mark in found["marks"] if mark["kind"] == "first difference"]
-    here, there = (
-        dict(zip(curve["time_s"], curve["values"], strict=True)) for curve in found["curves"]
-    )
-    differing = [time_s for time_s in here if time_s in there and here[time_s] != there[time_s]]
-    assert mark["time_s"] == min(differing)
+    here, there = found["curves"]
+    # The folders have the same name.
+    assert (here["run"], there["run"]) == (str(run), str(slow))
+    assert here["values"] != there["values"]
+    slow.rename(tmp_path / "slow")
+    shown = rack("plot", run, COUNT, "--against", tmp_path / "slow").stdout.splitlines()
+    assert "0 run  1 slow" in [line.strip() for line in shown]
 
 
 @pytest.mark.slow

@@ -51,5 +51,4 @@ def test_recording_and_report_agree_with_the_inbox_of_the_board(
     assert (inbox["board"], inbox["depth"], inbox["waiting"]) == ("hub", 2, 2)
     assert (inbox["served"], inbox["lost"]) == (3 * TICKS, 2 * TICKS)
     assert inbox["latency_us"]["max"] == 3 * inbox["latency_us"]["min"]
-    line = f"interrupts of hub: {3 * TICKS} messages served, at most 2 waiting, room for 2, "
-    assert f"{line}{2 * TICKS} lost" in text
+    assert "## Interrupts of boards: 1" in text.splitlines()

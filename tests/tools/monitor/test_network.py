@@ -29,7 +29,6 @@ from rack.tools.monitor.network import (
 from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.report.report import summarize_network
-from rack.tools.report.report_markdown import _format_network
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text(
@@ -115,6 +114,4 @@ def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
         {"peer": "other-one", "state": "lost", "losses": 1, "restarts": 1, "lost_s": 0.04},
         {"peer": "third", "state": "awaited", "losses": 0, "restarts": 0, "lost_s": 0.0},
     ]
-    lines = list(_format_network(found))
-    assert "- rack other-one: lost; lost 1 times, 0.04 s; restarted 1 times" in lines
     assert summarize_network(SimpleNamespace(config='name = "alone"', mailboxes=())) is None  # type: ignore[arg-type]

@@ -84,4 +84,4 @@ def test_an_object_released_in_the_air_is_reported_with_its_fall(
     (end,) = report["objects"]
     (drop,) = end["drops"]
     assert drop["mm"] == pytest.approx(100.0, abs=5.0)
-    assert f"- block1 fell {drop['mm']:.0f} mm at tick {drop['tick']}\n" in text
+    assert f"tick {drop['tick']}, mm {drop['mm']:g}" in text

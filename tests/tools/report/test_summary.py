@@ -320,7 +320,7 @@ def test_run_and_report_print_the_summary_and_all_tables_only_with_full(
     assert f"{rack_name} 0.20 s  tick " in ran.stderr
     full = rack("report", tmp_path / "run", "--full").stdout
     assert json.loads((tmp_path / "run" / "report.json").read_text())["digest"] in flat([full])
-    assert {"Cycles, ms", "System response, ms of simulated time"} <= set(full.splitlines())
+    assert {"Cycles, ms", "System response, ms of simulated time: 2"} <= set(full.splitlines())
     wide = [line for line in full.splitlines() if len(line) > 100 and str(tmp_path) not in line]
     assert not wide
     bare = rack(*words, "--no-record").stdout.splitlines()

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.tools.viewer.cell import STEP_RAD, find_moving_bodies, subdivide_path
+from rack.tools.viewer.cell import STEP_RAD, subdivide_path
 from rack.tools.viewer.shapes import build_shape, transform_to_body
 
 MODEL = """
@@ -90,10 +90,6 @@ def test_points_of_a_geom_are_placed_as_mujoco_places_them(model: mujoco.MjModel
     body = model.geom_bodyid[geom]
     in_body = transform_to_body(model, geom, point)[0]
     assert data.xpos[body] + data.xmat[body].reshape(3, 3) @ in_body == pytest.approx(expected)
-
-
-def test_bodies_on_joints_and_mocap_bodies_are_moving_bodies(model: mujoco.MjModel) -> None:
-    assert [model.body(body).name for body in find_moving_bodies(model)] == ["arm", "hand", "post"]
 
 
 def test_a_path_is_drawn_in_small_pieces_through_its_corners() -> None:
