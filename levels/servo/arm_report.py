@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
-from rack.levels.arm import Arm, Sensed
+from rack.levels.arm import Sensed
 from rack.levels.messages import ArmState, DrivenArm, Error
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Stopping
+
+if TYPE_CHECKING:
+    from rack.levels.arm import Arm
 
 
 class SetPointStatus(NamedTuple):

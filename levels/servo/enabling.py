@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
-from rack.levels.arm import Arm, DriveState, Sensed
+from rack.levels.arm import DriveState, Sensed
 from rack.levels.level import LevelContext, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Stopping
+
+if TYPE_CHECKING:
+    from rack.levels.arm import Arm
 
 
 class Enabling:
