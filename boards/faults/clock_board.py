@@ -161,8 +161,11 @@ def _find_next_change(entry: FaultEntry, tick: int) -> int:
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
-        may_end_early = find_kind(entry).once or _find_step(entry) is not ELSEWHERE
-        return tick + 1 if may_end_early else entry.until
+        kind = find_kind(entry)
+        may_end_early = kind.once or _find_step(entry) is not ELSEWHERE
+        # A fault that takes computing time needs each tick alone, because releases may be missed.
+        takes_time = kind.where in ("load", "core")
+        return tick + 1 if may_end_early or takes_time else entry.until
     return NEVER
 
 

@@ -139,7 +139,6 @@ KINDS.add(
         # The cycle is still running at its next release.
         bound=bounds.cycle_bound(1),
         lasts=draw.uniform_cycles(1, 4),
-        realtime=True,
     ),
     Kind(
         name="planner-slow",
@@ -161,7 +160,6 @@ KINDS.add(
         detected_as=(Alarm.PLAN_LATE,),
         bound=bounds.SLICE + bounds.RELEASE,
         lasts=draw.longest_of(draw.uniform_cycles(3, 6), draw.uniform_seconds(1.0, 2.0)),
-        realtime=True,
     ),
     Kind(
         name="hog",

@@ -29,19 +29,30 @@ MAX_POLL_S = 0.05
 
 
 @dataclass(frozen=True)
+class SimulatedClock:
+    """Simulated time since tick 0, with the methods of `SystemClock` that load steps use."""
+
+    period_ns: int
+
+    def compute_time_ns(self, tick: int) -> int:
+        """Return the time of a tick in ns."""
+        return tick * self.period_ns
+
+
+@dataclass(frozen=True)
 class ExtraComputing:
     """Extra computing time in a task's cycle.
 
     Attributes:
         entry: The fault.
         spec: The affected task.
-        clock: System clock of the rack.
+        clock: Clock on which the computing takes time.
         until: Step of the kind, which computes when the extra computing ends.
     """
 
     entry: FaultEntry
     spec: TaskSpec
-    clock: SystemClock
+    clock: SystemClock | SimulatedClock
     until: LoadStep
 
     def burn_time(self, tick: int) -> None:
@@ -60,7 +71,7 @@ class ExtraComputing:
 LoadStep = Callable[[ExtraComputing, int, int], int]
 """Computes the time at which extra computing ends from the load, the tick and the current time.
 
-Times are CLOCK_MONOTONIC in ns.
+Times are CLOCK_MONOTONIC in ns, in lockstep simulated ns since tick 0.
 """
 
 
@@ -70,10 +81,10 @@ def compute_cycle_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
         tick: Release of the cycle.
-        now_ns: Current CLOCK_MONOTONIC in ns.
+        now_ns: Current time in ns.
 
     Returns:
-        CLOCK_MONOTONIC in ns at which the computing ends.
+        Time in ns at which the computing ends.
     """
     by, is_random, *_ = load.entry.parameters
     fraction = random.Random(load.entry.seed + tick).random() if is_random else 1.0
@@ -86,10 +97,10 @@ def compute_slice_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameter `by`.
         tick: Release of the slice.
-        now_ns: Current CLOCK_MONOTONIC in ns.
+        now_ns: Current time in ns.
 
     Returns:
-        CLOCK_MONOTONIC in ns at which the computing ends.
+        Time in ns at which the computing ends.
     """
     slice_end = load.clock.compute_time_ns(tick + load.spec.slice)
     return max(now_ns, slice_end) + load.cycles_ns(load.entry.parameters[0])
@@ -120,7 +131,8 @@ class TaskFaults:
         self._index = segment.layout.processes.index(spec)
         self._apply = apply
         self._level = level
-        self._clock = SystemClock(segment)
+        clock = SystemClock(segment)
+        self._clock = SimulatedClock(segment.layout.clock_ns) if clock.is_lockstep else clock
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
 
@@ -153,9 +165,25 @@ class TaskFaults:
         return generation if len(active) == len(begun) else -1
 
     def burn_time(self, tick: int) -> None:
-        """Keep the processor busy for each active fault in turn."""
+        """In real time, keep the processor busy for each active fault in turn."""
+        if isinstance(self._clock, SystemClock):
+            for load in self.loads:
+                load.burn_time(tick)
+
+    def extend_computing(self, tick: int, begin_ns: int, end_ns: int) -> int:
+        """In lockstep, return the end of the computing with the active faults.
+
+        This is a `rack.boards.run.simulated_time.FinishStep`.
+
+        Args:
+            tick: Release tick of the cycle.
+            begin_ns: Begin of the cycle.
+            end_ns: End of the cycle without the faults.
+        """
         for load in self.loads:
-            load.burn_time(tick)
+            load.entry.record_action(tick)
+            end_ns = load.until(load, tick, end_ns)
+        return end_ns
 
     def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:
         """Record which faults of the arm acted in the cycle released at `tick`.

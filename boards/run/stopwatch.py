@@ -145,8 +145,8 @@ class Stopwatch:
         )
         self._cycles = block[Block.CYCLES] = self._cycles + 1
         block[Block.DONE] = done
-        if lockstep_done is not None and done >= block[Block.RELEASED]:
-            # This was the last release of a batch.
+        if lockstep_done is not None and (is_missed or done >= block[Block.RELEASED]):
+            # This was the last release of a batch, or the clock waits for a late cycle.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
             self.update_bus_counters()

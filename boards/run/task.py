@@ -16,6 +16,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.faults.tasks import TaskFaults
 from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.boards.run.simulated_time import SimulatedTime
 from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -32,6 +33,7 @@ class Task(ABC):
     Attributes:
         spec: Description of the task from the layout.
         block: Control block of the task.
+        simulated: Simulated times of the cycles, in lockstep.
         serve: Function that serves the board's interrupts in each cycle. None if nothing
             interrupts the board, or another of its tasks serves the interrupts.
     """
@@ -71,6 +73,7 @@ class Task(ABC):
         )
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs.apply_faults, level)
+        self.simulated = SimulatedTime(segment, spec)
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
@@ -83,7 +86,24 @@ class Task(ABC):
             return None
         if self.words[System.FAULTS] != self._generation:
             self._generation = self.faults.refresh_faults(tick)
+            if self.clock.is_lockstep:
+                self.simulated.insert_step(self.faults.extend_computing, bool(self.faults.loads))
         return tick
+
+    def end_computing(self, tick: int, deadline: int) -> int | None:
+        """In lockstep, wait until the clock has begun the tick in which the computing ends.
+
+        Args:
+            tick: Release tick of the cycle.
+            deadline: Tick before which the cycle must end.
+
+        Returns:
+            That tick. None if the messages of the cycle are the same without a wait.
+        """
+        end_tick = self.simulated.find_end_tick(tick, deadline)
+        if end_tick is not None:
+            self.next_cycle.wait_for_tick(end_tick)
+        return end_tick
 
     def run(self) -> None:
         """Cycle until the run is over."""
