@@ -225,6 +225,13 @@ class NextCycle:
         """True if the task's first release is past. Before it, the clock may not have started."""
         return self._due > self._spec.phase
 
+    def return_release(self, tick: int) -> None:
+        """Return the release at `tick`, which `wait` has given: the next call counts it as skipped.
+
+        That call gives it again if there is no newer one.
+        """
+        self._due = tick - self.skipped * self._spec.every
+
     def wait_for_tick(self, tick: int) -> None:
         """In lockstep, wait in the middle of a cycle until the clock has begun `tick`.
 

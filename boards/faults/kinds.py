@@ -169,7 +169,6 @@ KINDS.add(
         detected_as=(Alarm.STARVED,),
         bound=bounds.cycle_bound(4 + 1),
         lasts=draw.longest_of(draw.uniform_cycles(7, 9), draw.uniform_seconds(0.1, 0.3)),
-        realtime=True,
     ),
     _message(
         name="mute",
@@ -358,7 +357,6 @@ KINDS.add(
         detected_as=(Alarm.CLOCK_LATE,),
         bound=bounds.tick_bound(2),
         lasts=draw.uniform_seconds(0.2, 0.6),
-        realtime=True,
     ),
     _sensor(
         name="sensor-nan",

@@ -16,6 +16,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.process import pin_to_core
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
+from rack.boards.faults.clock_board import ClockStep
 from rack.boards.faults.kind import find_kind
 from rack.levels.fault_steps import Fault
 
@@ -117,6 +118,7 @@ class TaskFaults:
 
     Attributes:
         loads: Extra computing of the active faults.
+        taken_until: In lockstep, tick until which faults take the core from this task.
     """
 
     def __init__(
@@ -128,6 +130,7 @@ class TaskFaults:
     ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
+        self._tasks = segment.layout.tasks
         self._index = segment.layout.processes.index(spec)
         self._apply = apply
         self._level = level
@@ -135,6 +138,8 @@ class TaskFaults:
         self._clock = SimulatedClock(segment.layout.clock_ns) if clock.is_lockstep else clock
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
+        self.taken_until = 0
+        self._late_ticks: list[FaultEntry] = []
 
     def refresh_faults(self, tick: int) -> int:
         """Apply the faults that are active at `tick`.
@@ -142,10 +147,13 @@ class TaskFaults:
         Returns:
             Generation of the fault table, so that the caller can skip this call while it is
             unchanged. -1 if a fault is marked as active but begins at a later tick, which happens
-            because the clock works ahead of the grid. The next cycle must then call this again.
+            because the clock works ahead of the grid. The next cycle must then call this again. In
+            lockstep also -1 while ticks are late, because each has another lateness.
         """
         generation = self._table.generation
         entries = self._table.list_entries((Stage.ACTIVE,))
+        if isinstance(self._clock, SimulatedClock):
+            self._refresh_simulated_faults(entries, tick)
         begun = [(find_kind(entry), entry) for entry in entries if entry.task == self._index]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [
@@ -162,7 +170,32 @@ class TaskFaults:
                 for kind, entry in arm_faults
             ]
             cast("Executor", self._level).inject(faults)
-        return generation if len(active) == len(begun) else -1
+        return generation if len(active) == len(begun) and not self._late_ticks else -1
+
+    def _refresh_simulated_faults(self, entries: Sequence[FaultEntry], tick: int) -> None:
+        """Find the active faults of the core and the clock, which act in each task in lockstep."""
+        spec = self._spec
+        self.taken_until = 0
+        self._late_ticks = []
+        for entry in entries:
+            kind = find_kind(entry)
+            if kind.where == "core" and entry.task >= 0:
+                struck = self._tasks[entry.task]
+                if struck.core == spec.core and struck.priority >= spec.priority:
+                    self.taken_until = max(self.taken_until, entry.until)
+                    if struck is spec:
+                        entry.record_action(tick)
+            elif isinstance(kind.step, ClockStep) and kind.step.lateness is not None:
+                self._late_ticks.append(entry)
+
+    def find_lateness(self, tick: int) -> float:
+        """In lockstep, return by how many ticks the clock begins `tick` late."""
+        late = [
+            step.lateness(entry, tick)
+            for entry in self._late_ticks
+            if isinstance(step := find_kind(entry).step, ClockStep) and step.lateness is not None
+        ]
+        return max(late, default=0.0)
 
     def burn_time(self, tick: int) -> None:
         """In real time, keep the processor busy for each active fault in turn."""

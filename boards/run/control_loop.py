@@ -93,6 +93,11 @@ class VirtualControlLoop(Task):
         in_time = in_time and (ended is None or ended < deadline)
         watch.finish_cycle(in_time, deadline, done=tick)
 
+    def set_lateness(self, ticks: float) -> None:
+        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
+        super().set_lateness(ticks)
+        self.executor.late_s = ticks * self.simulated.clock_ns * 1e-9
+
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
 
@@ -103,7 +108,7 @@ class VirtualControlLoop(Task):
             self.inputs.task.since = tick
             self._has_cycled = True
         if self._guard is not None:
-            self._guard.check_release(tick)
+            self._guard.check_release(tick, self.stopwatch.late_ns)
 
     def process(self, tick: int) -> None:
         """Run the level's `process`, then handle its findings and the faults that are active."""

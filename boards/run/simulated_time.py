@@ -35,6 +35,7 @@ class SimulatedTime:
     Attributes:
         steps: Steps that determine the end of a cycle, in their order.
         clock_ns: Length of a tick.
+        late_ns: Time by which the clock is late for the present release.
         begin_ns: Begin of the last cycle.
         end_ns: End of the last cycle.
     """
@@ -43,7 +44,7 @@ class SimulatedTime:
         layout = segment.layout
         self.clock_ns = layout.clock_ns
         self.steps: list[FinishStep] = []
-        self.begin_ns = self.end_ns = 0
+        self.late_ns = self.begin_ns = self.end_ns = 0
         self._shows_at_once = not all(
             mailbox.is_repeatable for mailbox in layout.mailboxes if mailbox.writer == spec.name
         )
@@ -52,19 +53,18 @@ class SimulatedTime:
         """Make a step the first one if it is active. Otherwise remove it."""
         self.steps = [step] * is_active + [other for other in self.steps if other != step]
 
-    def find_end_tick(self, tick: int, deadline: int, late_ns: int = 0) -> int | None:
+    def find_end_tick(self, tick: int, deadline: int) -> int | None:
         """Compute the end of a cycle.
 
         Args:
             tick: Release tick of the cycle.
             deadline: Tick before which the cycle must end.
-            late_ns: Time by which the clock was late for this release.
 
         Returns:
             The tick in which the cycle ends if the cycle must wait for it before it writes,
             otherwise None.
         """
-        self.begin_ns = end_ns = max(tick * self.clock_ns + late_ns, self.end_ns)
+        self.begin_ns = end_ns = max(tick * self.clock_ns + self.late_ns, self.end_ns)
         for step in self.steps:
             end_ns = step(tick, self.begin_ns, end_ns)
         self.end_ns = end_ns

@@ -81,14 +81,25 @@ class Task(ABC):
 
         Faults of the task begin and end during this call, between two cycles.
         """
-        tick = self.next_cycle.wait()
-        if tick is None:
-            return None
-        if self.words[System.FAULTS] != self._generation:
-            self._generation = self.faults.refresh_faults(tick)
-            if self.clock.is_lockstep:
-                self.simulated.insert_step(self.faults.extend_computing, bool(self.faults.loads))
-        return tick
+        while (tick := self.next_cycle.wait()) is not None:
+            if self.words[System.FAULTS] == self._generation:
+                return tick
+            faults = self.faults
+            self._generation = faults.refresh_faults(tick)
+            if faults.taken_until <= tick:
+                if self.clock.is_lockstep:
+                    self.simulated.insert_step(faults.extend_computing, bool(faults.loads))
+                    self.set_lateness(faults.find_lateness(tick))
+                return tick
+            # The core is taken: the task gets its newest release once the core is free again.
+            self.next_cycle.return_release(tick)
+            self.next_cycle.wait_for_tick(faults.taken_until)
+        return None
+
+    def set_lateness(self, ticks: float) -> None:
+        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
+        self.simulated.late_ns = int(ticks * self.simulated.clock_ns)
+        self.stopwatch.late_ns = int(ticks * self.clock.period_ns)
 
     def end_computing(self, tick: int, deadline: int) -> int | None:
         """In lockstep, wait until the clock has begun the tick in which the computing ends.
@@ -155,18 +166,20 @@ class ClockGuard:
             )
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
-    def check_release(self, tick: int) -> None:
+    def check_release(self, tick: int, late_ns: int = 0) -> None:
         """Raise an alarm, once per episode, if the cycle began late because the clock was late.
 
         Args:
             tick: Release tick of the cycle.
+            late_ns: In lockstep, lateness of the clock.
         """
         words = self._words
-        late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
-        # Check this after reading the time, which belongs to this tick only if the clock has not
-        # advanced since.
-        if self._clock.is_lockstep or words[System.TICK] != tick:
-            return
+        if not self._clock.is_lockstep:
+            late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
+            # Check this after reading the time, which belongs to this tick only if the clock has
+            # not advanced since.
+            if words[System.TICK] != tick:
+                return
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:
                 self._alarms.raise_alarm(tick, Alarm.CLOCK_LATE, value=late_ns)
