@@ -302,6 +302,8 @@ class LevelSection:
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
+        # In lockstep, time in s by which the clock is late for this cycle, set by the board.
+        self.late_s = 0.0
         self.ports: dict[str, Any] = {}
         """Readings and messages of the ports that a config creates, by name."""
         if self.params is not None:
