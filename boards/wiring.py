@@ -160,6 +160,7 @@ class ClockWiring:
         linger: Time from that status to the end of the run.
         silent: The run also ends if `ends_run` has no new message for this time, unless its
             writer is lost.
+        longest: The run also ends after this time. 0 for no limit.
         history: Number of ticks by which the clock may be ahead of a recorder in lockstep.
         core: Processor core.
         priority: SCHED_FIFO priority.
@@ -175,6 +176,7 @@ class ClockWiring:
     ends_run: str | None
     linger: int
     silent: int
+    longest: int
     history: int
     core: int
     priority: int

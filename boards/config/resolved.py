@@ -158,6 +158,7 @@ class Resolved:
             ends_run=ends_run,
             linger=self._to_ticks(LINGER_S),
             silent=silent,
+            longest=self._to_ticks(config.supervision.lockstep_end_s) * config.is_lockstep,
             history=self._to_ticks(AHEAD_S),
             core=core,
             priority=clock.priority,

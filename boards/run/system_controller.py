@@ -277,7 +277,7 @@ class EndOfRun:
 
     A run ends at the tick that its config gives. Without such a tick, it ends a fixed time after
     its task: after the status of the level that ends the run reports done or error, or has been
-    missing for too long. The end of the task is determined even if the config gives a tick, because
+    missing for too long, or after the longest permitted time in lockstep. The end of the task is determined even if the config gives a tick, because
     a run that continues this one may end with the task.
     """
 
@@ -287,6 +287,7 @@ class EndOfRun:
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._silent = wiring.silent
+        self._longest = wiring.longest or sys.maxsize
         self._heard: int | None = None
         # Under a tick-based protocol, messages become visible only at ticks of the mailbox's grid.
         self._every = 1
@@ -319,7 +320,7 @@ class EndOfRun:
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
                 self._heard = boundary
             is_over = reading.is_new and reading.message.state in (State.DONE, State.ERROR)
-            if is_over or boundary - self._heard >= self._silent:
+            if is_over or boundary - self._heard >= self._silent or tick >= self._longest:
                 self._task_ends = max(boundary + self._linger, tick)
         return self._task_ends if self._stop_tick is None else self._stop_tick
 
