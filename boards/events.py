@@ -34,6 +34,8 @@ OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 CONTINUATION_CODE = "continues"
 """Code of the launch event of a run that continues another one. Its tick is the run's first."""
+OF_LAUNCH = ("launch", "ready", "start")
+"""Kinds of events that each launch reports. A continuation does not take them over."""
 
 
 @dataclass(frozen=True)
