@@ -277,8 +277,9 @@ class EndOfRun:
 
     A run ends at the tick that its config gives. Without such a tick, it ends a fixed time after
     its task: after the status of the level that ends the run reports done or error, or has been
-    missing for too long, or after the longest permitted time in lockstep. The end of the task is determined even if the config gives a tick, because
-    a run that continues this one may end with the task.
+    missing for too long, or after the longest permitted time in lockstep. The end of the task is
+    determined even if the config gives a tick, because a run that continues this one may end with
+    the task.
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
