@@ -106,6 +106,7 @@ class TaskWiring:
         exchange: Rules for input ports that are read at a different rate or asynchronously. If
             there are any, the task writes its mailbox `<board>.exchange`.
         reservation: Processor time to reserve instead of a priority, None for none.
+        budget_ns: Budgeted processor time of a cycle or plan. 0 without a budget.
     """
 
     task: str
@@ -121,6 +122,7 @@ class TaskWiring:
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None
+    budget_ns: int
 
 
 @dataclass(frozen=True)

@@ -314,6 +314,7 @@ class Examination:
             reservation=compute_reservation(
                 self._config, board.busy_ms if is_executor else 0.0, spec.every
             ),
+            budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

@@ -268,6 +268,11 @@ class BoardConfig(PlacedConfig):
             return 0.0
         return cost.exchange_ms + cost.read_ms + cost.process_ms + cost.write_ms
 
+    @property
+    def planning_ms(self) -> float:
+        """Budgeted processor time of one plan in ms. 0 without a budget."""
+        return 0.0 if self.budget is None else self.budget.plan_ms + self.budget.update_ms
+
 
 LAN = "lan"
 """Name of the board that exchanges mailboxes with other racks."""

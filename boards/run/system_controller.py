@@ -353,6 +353,8 @@ def run_clock(
         one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
         one_at_a_time |= any(len(layout.find_pacers(host)) > 1 for host in layout.hosts)
         driver = LockstepDriver(segment, end_of_run, one_at_a_time, wiring.history, alarms)
+        # A board that is interrupted may miss releases at any tick.
+        driver.permits_batches &= all(mailbox.interrupt is None for mailbox in layout.mailboxes)
         if copier is not None:
             driver.snapshot = ClockCopies(segment, driver, copier)
     else:
