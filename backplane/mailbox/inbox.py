@@ -12,6 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from heapq import merge
+from operator import itemgetter
 from typing import NamedTuple
 
 
@@ -171,11 +172,12 @@ def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
 
 
 def _merge_arrivals(sources: Sequence[InterruptSource], since_ns: int) -> Iterator[tuple[int, int]]:
-    """Yield the arrivals of all sources after `since_ns`, in order.
+    """Yield the arrivals of all sources after `since_ns`, by time and then by source.
 
     Each is the time of arrival and the service time of a message.
     """
-    return merge(*(_iterate_arrivals(source, since_ns) for source in sources))
+    arrivals = (_iterate_arrivals(source, since_ns) for source in sources)
+    return merge(*arrivals, key=itemgetter(0))
 
 
 def _iterate_arrivals(source: InterruptSource, since_ns: int) -> Iterator[tuple[int, int]]:
