@@ -35,6 +35,8 @@ Its window holds the fault table, the operator table and the operators' mailboxe
 """
 MAILBOX_HEAD_SIZE = 2 * CACHE_LINE
 SLOT_HEAD_SIZE = 64
+SCRATCH_SIZE = CACHE_LINE
+"""Size of the scratch words of a host board, in bytes."""
 ALARM_SIZE = CACHE_LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 """Bytes of one alarm ring: a cache line for its head, followed by the records."""
 
@@ -71,7 +73,27 @@ class AddressMap:
         self.done = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
         locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
         self.locks = {name: self._reserve(CACHE_LINE) for name in locked}
+        self.scratch = {host.name: self._reserve(SCRATCH_SIZE) for host in layout.hosts}
         self.size = round_up_to_pages(self._end)
+
+    def describe_owner(self, address: int) -> str:
+        """Return a description of what contains an address on the bus, with its writer."""
+        places = {
+            0: "the words of the Rack and the system clock",
+            self.faults: "the fault table",
+            self.operator: "the operator table",
+            **{at: f"the alarms of '{name}'" for name, at in self.alarms.items()},
+            **{at: f"the control block of '{name}'" for name, at in self.blocks.items()},
+            **{at: f"the trace of '{name}'" for name, at in self.traces.items()},
+            **{
+                at: f"mailbox '{name}', whose messages have checksums and one writer"
+                for name, at in self.mailboxes.items()
+            },
+            **dict.fromkeys((*self.wake.values(), *self.done.values()), "a semaphore"),
+            **{at: f"the lock of '{name}'" for name, at in self.locks.items()},
+            **{at: f"the scratch words of '{name}'" for name, at in self.scratch.items()},
+        }
+        return places[max(start for start in places if start <= address)]
 
     def _reserve(self, size: int) -> int:
         """Reserve `size` bytes, starting on a new cache line, and return their address."""

@@ -34,6 +34,8 @@ OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 CONTINUATION_CODE = "continues"
 """Code of the launch event of a run that continues another one. Its tick is the run's first."""
+OF_LAUNCH = ("launch", "ready", "start")
+"""Kinds of events that each launch reports. A continuation does not take them over."""
 
 
 @dataclass(frozen=True)
@@ -285,12 +287,16 @@ class Ending:
         segment: Memory of the rack.
         ends_run: Status mailbox of the level that ends the run, as in `ClockWiring`.
         silent: Number of ticks without a status after which the run ends, as in `ClockWiring`.
+        longest: Number of ticks after which the run ends, as in `ClockWiring`.
     """
 
-    def __init__(self, segment: Segment, ends_run: str | None, silent: int) -> None:
+    def __init__(
+        self, segment: Segment, ends_run: str | None, silent: int, longest: int = 0
+    ) -> None:
         self._segment = segment
         self._ends_run = ends_run
         self._silent = silent
+        self._longest = longest
         self._observer = None if ends_run is None else open_observer(segment, ends_run)
 
     def find_final_state(self) -> tuple[str, str]:
@@ -302,12 +308,15 @@ class Ending:
         if self._observer is None:
             return "", ""
         status = self._observer.peek().message
-        silent_s = self._compute_silent_ticks() * self._segment.layout.clock_ns * 1e-9
-        reason = (
-            f"'{self._ends_run}' has not been written for {silent_s:g} s"
-            if silent_s
-            else get_reason(status)
-        )
+        tick_s = self._segment.layout.clock_ns * 1e-9
+        reason = get_reason(status)
+        if silent_ticks := self._compute_silent_ticks():
+            reason = f"'{self._ends_run}' has not been written for {silent_ticks * tick_s:g} s"
+        elif self._is_too_long:
+            reason = (
+                f"'{self._ends_run}' has been neither done nor error for {self._longest * tick_s:g}"
+                f" s, the limit supervision.lockstep_end_s{reason and f': {reason}'}"
+            )
         return format_state(status.state), reason
 
     def list_latched_faults(self) -> list[str]:
@@ -416,12 +425,24 @@ class Ending:
             return "time over"
         status = self._observer.peek().message
         fields = self._segment.layout.find_mailbox(self._ends_run).fields
-        if status.state != State.ERROR and not self._compute_silent_ticks():
+        is_ended = self._compute_silent_ticks() or self._is_too_long
+        if status.state != State.ERROR and not is_ended:
             return "task done" if status.state == State.DONE else "time over"
         # The field `moves` of a status counts the moves of the task. A refused task has none.
         counts_moves = any(field.name == "moves" and not field.shape for field in fields)
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
+
+    @property
+    def _is_too_long(self) -> bool:
+        """Whether the run has lasted too long without a status with state done or error.
+
+        Read this only if a level ends the run.
+        """
+        assert self._observer is not None, "some level ends the run"
+        state = self._observer.peek().message.state
+        ticks = self._segment.words[System.TICK]
+        return 0 < self._longest <= ticks and state not in (State.DONE, State.ERROR)
 
     def _compute_silent_ticks(self) -> int:
         """Return for how many ticks the level that ends the run has written no status.

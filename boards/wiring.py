@@ -106,6 +106,7 @@ class TaskWiring:
         exchange: Rules for input ports that are read at a different rate or asynchronously. If
             there are any, the task writes its mailbox `<board>.exchange`.
         reservation: Processor time to reserve instead of a priority, None for none.
+        budget_ns: Budgeted processor time of a cycle or plan. 0 without a budget.
     """
 
     task: str
@@ -121,6 +122,7 @@ class TaskWiring:
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None
+    budget_ns: int
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ class ClockWiring:
         linger: Time from that status to the end of the run.
         silent: The run also ends if `ends_run` has no new message for this time, unless its
             writer is lost.
+        longest: The run also ends after this time. 0 for no limit.
         history: Number of ticks by which the clock may be ahead of a recorder in lockstep.
         core: Processor core.
         priority: SCHED_FIFO priority.
@@ -175,6 +178,7 @@ class ClockWiring:
     ends_run: str | None
     linger: int
     silent: int
+    longest: int
     history: int
     core: int
     priority: int

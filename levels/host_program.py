@@ -92,6 +92,20 @@ class Bus(Protocol):
             ValueError: The address is not aligned to a word, or the words extend beyond the memory.
         """
 
+    @property
+    def scratch(self) -> int:
+        """Bus address of the first of the 8 scratch words that the program may write."""
+
+    def write(self, address: int, value: int) -> None:
+        """Write a scratch word of the program's board: a signed 64-bit integer.
+
+        The memory changes at once. A level must learn of it by a message, so that the change takes
+        effect at a tick and is recorded.
+
+        Raises:
+            ValueError: The address is not a scratch word's, or the value is no 64-bit integer.
+        """
+
     def finish(self) -> None:
         """Report that the program has finished its work, as returning from `run` does."""
 

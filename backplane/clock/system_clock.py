@@ -15,6 +15,7 @@ class SystemClock:
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
+        self._clock_ns = segment.layout.clock_ns
         self.is_lockstep = bool(self._words[System.LOCKSTEP])
 
     @property
@@ -36,6 +37,11 @@ class SystemClock:
         if self.is_lockstep:
             return self._words[System.TICK]
         return (monotonic_ns() - self._words[System.EPOCH_NS]) // self._words[System.PERIOD_NS]
+
+    def compute_simulated_ns(self) -> int:
+        """Return the simulated time since tick 0 in ns, in real time."""
+        ns = (monotonic_ns() - self._words[System.EPOCH_NS]) * self._clock_ns
+        return ns // self._words[System.PERIOD_NS]
 
     @property
     def period_ns(self) -> int:

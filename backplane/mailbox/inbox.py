@@ -12,6 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from heapq import merge
+from operator import itemgetter
 from typing import NamedTuple
 
 
@@ -28,7 +29,8 @@ class Inbox:
         self.lost = 0
         self.most_waiting = 0
         """Largest number of messages that waited at the same time."""
-        self._free_ns = 0
+        self.free_ns = 0
+        """Time at which the handler has served all messages added so far."""
         self._starts: deque[int] = deque()
 
     def add_message(self, at_ns: int, service_ns: int) -> int | None:
@@ -47,14 +49,50 @@ class Inbox:
         if len(starts) >= self.depth:
             self.lost += 1
             return None
-        start_ns = max(at_ns, self._free_ns)
+        start_ns = max(at_ns, self.free_ns)
         if start_ns > at_ns:
             starts.append(start_ns)
             self.most_waiting = max(self.most_waiting, len(starts))
-        self._free_ns = start_ns + service_ns
-        return self._free_ns
+        self.free_ns = start_ns + service_ns
+        return self.free_ns
+
+    def add_arrivals(
+        self, sources: Sequence[InterruptSource], since_ns: int, until_ns: int
+    ) -> None:
+        """Add the messages that arrive after `since_ns` and up to `until_ns`.
+
+        Args:
+            sources: Periodic messages.
+            since_ns: Time up to which messages have been added.
+            until_ns: Time of the last message to add.
+        """
+        for at_ns, service_ns in _merge_arrivals(sources, since_ns):
+            if at_ns > until_ns:
+                break
+            self.add_message(at_ns, service_ns)
+
+    def compute_end(self, work: Work, sources: Sequence[InterruptSource], since_ns: int) -> int:
+        """Return when a computation ends that the handler preempts. The inbox does not change.
+
+        Args:
+            work: The computation.
+            sources: Periodic messages that will arrive, in addition to those already added.
+            since_ns: Time after which these messages arrive.
+        """
+        ahead = Inbox(self.depth)
+        ahead.free_ns = self.free_ns
+        ahead._starts.extend(self._starts)
+        end_ns = work.begin_ns + max(0, self.free_ns - work.begin_ns) + work.time_ns
+        for at_ns, service_ns in _merge_arrivals(sources, since_ns):
+            if at_ns >= min(end_ns, work.limit_ns):
+                break
+            if (served_ns := ahead.add_message(at_ns, service_ns)) is not None:
+                end_ns += max(0, served_ns - max(served_ns - service_ns, work.begin_ns))
+        return min(end_ns, work.limit_ns)
 
 
+MAX_PREEMPTED_CYCLES = 8
+"""Number of cycles after which a computation ends although its handler never rests."""
 FULL_LOAD = 0.999
 """Load of a handler from which its inbox is considered overloaded.
 
@@ -62,11 +100,29 @@ It is below 1, so that the simulation of a burst stays short.
 """
 
 
+class Work(NamedTuple):
+    """Computation that begins at `begin_ns` and takes `time_ns` of its processor.
+
+    A handler that is always busy would keep it from ending, so it is taken to end at `limit_ns`.
+    """
+
+    begin_ns: int
+    time_ns: int
+    limit_ns: int
+
+
 class InterruptSource(NamedTuple):
-    """Periodic messages: one arrives every `every_ns`, and serving it takes `service_ns`."""
+    """Periodic messages: one arrives every `every_ns`, and serving it takes `service_ns`.
+
+    Attributes:
+        at_ns: Time at which the first of them arrives.
+        is_periodic: False for messages of a planner, which may come at any time.
+    """
 
     every_ns: int
     service_ns: int
+    at_ns: int = 0
+    is_periodic: bool = True
 
 
 class Burst(NamedTuple):
@@ -102,7 +158,8 @@ def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
     inbox = Inbox(sys.maxsize)
     free_ns = 0
     longest_ns = 0
-    for at_ns, service_ns in merge(*(_iterate_arrivals(source) for source in sources)):
+    together = [source._replace(at_ns=0) for source in sources]
+    for at_ns, service_ns in _merge_arrivals(together, -1):
         # All arrivals at time 0 belong to the burst. It ends when a later arrival finds the handler
         # idle.
         if at_ns and at_ns >= free_ns:
@@ -114,9 +171,20 @@ def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
     return Burst(load, inbox.most_waiting, longest_ns)
 
 
-def _iterate_arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
-    """Yield time of arrival and service time of each message of a source, from time 0 on."""
-    at_ns = 0
+def _merge_arrivals(sources: Sequence[InterruptSource], since_ns: int) -> Iterator[tuple[int, int]]:
+    """Yield the arrivals of all sources after `since_ns`, by time and then by source.
+
+    Each is the time of arrival and the service time of a message.
+    """
+    arrivals = (_iterate_arrivals(source, since_ns) for source in sources)
+    return merge(*arrivals, key=itemgetter(0))
+
+
+def _iterate_arrivals(source: InterruptSource, since_ns: int) -> Iterator[tuple[int, int]]:
+    """Yield the arrivals of one source after `since_ns`."""
+    at_ns = source.at_ns
+    if since_ns >= at_ns:
+        at_ns += ((since_ns - at_ns) // source.every_ns + 1) * source.every_ns
     while True:
         yield at_ns, source.service_ns
         at_ns += source.every_ns

@@ -33,8 +33,8 @@ from __future__ import annotations
 from collections import deque
 
 from rack.backplane.address_map import compute_oldest_intact
-from rack.backplane.layout import InterruptSpec, MailboxSpec
-from rack.backplane.mailbox.inbox import Inbox
+from rack.backplane.layout import InterruptSpec, Layout, MailboxSpec
+from rack.backplane.mailbox.inbox import Inbox, InterruptSource
 from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import AnyMessage
@@ -166,11 +166,14 @@ class BoardInbox:
         self.inbox = Inbox(min(get_interrupt_spec(box).depth for box in boxes))
         self.count = 0
         """Number of messages served."""
-        self.service_ns = 0
-        """Total time that the handler has spent on these messages."""
+        self.accepted_ns = 0
+        """Total time that the handler takes for all messages that were not lost."""
+        self.sources = list_sources(segment.layout, slot)
+        """Messages that interrupt the board, of all mailboxes."""
         self._lines = tuple(self.lines.values())
         self._clock_ns = segment.layout.clock_ns
         self._tick = -1
+        self._until_ns = -1
         self._newest_ns = 0
         # End of the service, line and serial of each message that waits or is being served.
         self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
@@ -181,6 +184,21 @@ class BoardInbox:
             return
         self._tick = tick
         until_ns = tick * self._clock_ns
+        self.collect_arrivals(until_ns)
+        in_service = self._in_service
+        while in_service and in_service[0][0] <= until_ns:
+            _, line, serial = in_service.popleft()
+            line.served.append(serial)
+            self.count += 1
+
+    def collect_arrivals(self, until_ns: int) -> None:
+        """Process all arrivals up to `until_ns` that were not processed before.
+
+        Their messages can be read only once `advance_to` has reached the end of their service.
+        """
+        if until_ns <= self._until_ns:
+            return
+        self._until_ns = until_ns
         arrivals: list[tuple[int, int, int]] = []
         for number, line in enumerate(self._lines):
             line.collect_arrivals(until_ns, number, arrivals)
@@ -188,12 +206,6 @@ class BoardInbox:
             arrivals.sort()
         for at_ns, number, serial in arrivals:
             self._add_arrival(at_ns, self._lines[number], serial)
-        in_service = self._in_service
-        while in_service and in_service[0][0] <= until_ns:
-            _, line, serial = in_service.popleft()
-            line.served.append(serial)
-            self.count += 1
-            self.service_ns += line.service_ns
 
     def _add_arrival(self, at_ns: int, line: InterruptLine, serial: int) -> None:
         """Add the arrival of a message to the inbox, or count it as lost if too many wait."""
@@ -205,6 +217,25 @@ class BoardInbox:
             line.lost += 1
         else:
             self._in_service.append((end_ns, line, serial))
+            self.accepted_ns += line.service_ns
+
+
+def list_sources(layout: Layout, slot: int) -> tuple[InterruptSource, ...]:
+    """Return the messages that interrupt the board in a slot, by mailbox.
+
+    It is assumed that a task writes in each of its cycles.
+    """
+    sources = []
+    for box in layout.list_interrupting_mailboxes(slot):
+        spec = get_interrupt_spec(box)
+        writer = layout.find_task(box.writer)
+        at_ns = writer.phase * layout.clock_ns + spec.sent_ns
+        sources.append(
+            InterruptSource(
+                box.every * layout.clock_ns, spec.service_ns, at_ns, writer.role != "planner"
+            )
+        )
+    return tuple(sources)
 
 
 def open_inbox(segment: Segment, task: str) -> BoardInbox | None:

@@ -153,6 +153,7 @@ class Resolved:
             ends_run=ends_run,
             linger=self._to_ticks(LINGER_S),
             silent=silent,
+            longest=self._to_ticks(config.supervision.lockstep_end_s) * config.is_lockstep,
             history=self._to_ticks(AHEAD_S),
             core=core,
             priority=clock.priority,
@@ -307,6 +308,7 @@ class Examination:
             reservation=compute_reservation(
                 self._config, board.busy_ms if is_executor else 0.0, spec.every
             ),
+            budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

@@ -185,6 +185,9 @@ class SupervisionConfig(Table):
     lockstep_restart_s: Positive = 0.5
     """simulated time after which a lost task returns in lockstep [s]; in real time it returns when
     it is ready"""
+    lockstep_end_s: Positive = 3600.0
+    """simulated time after which a run in lockstep fails if the level that ends it reports neither
+    done nor error [s]; `rack run --seconds` replaces it"""
     max_missed_fraction: float = Field(0.05, ge=0, le=1)
     """largest fraction of its cycles that a level may miss or skip in a successful run, rounded up
     to whole cycles; cycles due during an injected fault or the recovery from it do not count; 1: no
@@ -264,6 +267,11 @@ class BoardConfig(PlacedConfig):
         if cost is None:
             return 0.0
         return cost.exchange_ms + cost.read_ms + cost.process_ms + cost.write_ms
+
+    @property
+    def planning_ms(self) -> float:
+        """Budgeted processor time of one plan in ms. 0 without a budget."""
+        return 0.0 if self.budget is None else self.budget.plan_ms + self.budget.update_ms
 
 
 LAN = "lan"

@@ -7,8 +7,7 @@ from dataclasses import asdict, fields, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
-from rack.backplane.mailbox.inbox import InterruptSource
-from rack.backplane.mailbox.interrupt import get_interrupt_spec
+from rack.backplane.mailbox.interrupt import get_interrupt_spec, list_sources
 from rack.backplane.process import Reservation
 from rack.boards.config.schema import (
     BudgetConfig,
@@ -82,11 +81,17 @@ def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
         if boxes := layout.list_interrupting_mailboxes(slot):
             name = layout.find_interrupt_task(slot)
             names = tuple(box.name for box in boxes)
-            sources = tuple(
-                InterruptSource(box.every * layout.clock_ns, get_interrupt_spec(box).service_ns)
-                for box in boxes
+            task = layout.find_task(name)
+            due = task.slice if task.role == "planner" else layout.compute_due_ticks(task)
+            timings[name] = InboxTiming(
+                name,
+                names,
+                list_sources(layout, slot),
+                get_interrupt_spec(boxes[0]).depth,
+                period_ns=task.slice * layout.clock_ns,
+                first_ns=task.phase * layout.clock_ns,
+                due_ns=due * layout.clock_ns,
             )
-            timings[name] = InboxTiming(name, names, sources, get_interrupt_spec(boxes[0]).depth)
     return timings
 
 
@@ -100,7 +105,7 @@ def subtract_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> d
     return {
         name: replace(
             budget,
-            read_ns=max(0, budget.read_ns - timing.compute_interrupted_ns(name)),
+            process_ns=max(0, budget.process_ns - timing.compute_interrupted_ns(name)),
             plan_ns=max(0, budget.plan_ns - timing.compute_interrupted_ns(f"{name}.planner")),
         )
         for name, budget in measured.items()

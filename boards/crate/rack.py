@@ -227,6 +227,7 @@ class Rack:
         supervisor = self._supervisor
         plan = supervisor.plan
         clock = plan.build_clock_wiring(seconds)
+        supervisor.longest = clock.longest if seconds is None else 0
         if self._snapshots is not None or self._continues is not None:
             # Keep the last tick out of the clock's wiring: a run that continues from a snapshot may
             # end at another tick, and its wiring must be the same.

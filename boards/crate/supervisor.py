@@ -59,6 +59,8 @@ class Supervisor:
         self.pids: dict[str, int] = {}
         self.is_armed = False
         self.outcome: Outcome | None = None
+        self.longest = 0
+        """Ticks after which the run fails without an end of its task. 0 for no limit."""
         self._crate = crate
         self._journal = journal
         self._heartbeat = Heartbeat(segment)
@@ -189,7 +191,7 @@ class Supervisor:
         if not 0 <= stop < MOST_TICKS:
             raise DamageError(f"a run of {stop} ticks")
         clock = self.plan.build_clock_wiring(None)
-        ending = Ending(self.segment, clock.ends_run, clock.silent)
+        ending = Ending(self.segment, clock.ends_run, clock.silent, self.longest)
         state, reason = ending.find_final_state()
         cause: Cause = ending.find_cause()
         if self.recovery.given_up:

@@ -6,6 +6,7 @@ import os
 import time
 from typing import Any
 
+from rack.backplane.address_map import SCRATCH_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.errors import MailboxError
@@ -215,14 +216,46 @@ class HostBus:
         Raises:
             ValueError: The address is not a multiple of 8, or a word is not on the bus.
         """
+        for number in (address, count):
+            if not isinstance(number, int):
+                raise ValueError(f"{number!r}: addresses and counts must be integers")
         size = self._segment.map.size
         last = address + WORD * count
         if address % WORD or not 0 <= address < last <= size:
+            aligned = f"; addresses must be multiples of {WORD}" if address % WORD else ""
             raise ValueError(
                 f"words of {WORD} bytes at 0x{address:06x} to 0x{last:06x}: the bus has 0 to"
-                f" 0x{size:06x}"
+                f" 0x{size:06x}{aligned}"
             )
         return list(self._words[address // WORD : last // WORD])
+
+    @property
+    def scratch(self) -> int:
+        """Bus address of the first scratch word of this board."""
+        return self._segment.map.scratch[self._wiring.board]
+
+    def write(self, address: int, value: int) -> None:
+        """Write one of the scratch words of this board.
+
+        Args:
+            address: Bus address of the word, a multiple of 8.
+            value: The value, a signed 64-bit integer.
+
+        Raises:
+            ValueError: The address is invalid, the word is not a scratch word of this board, or the
+                value is not a 64-bit integer.
+        """
+        self.words(address)
+        first = self.scratch
+        if not first <= address < first + SCRATCH_SIZE:
+            raise ValueError(
+                f"the word at 0x{address:06x} is read-only: it belongs to"
+                f" {self._segment.map.describe_owner(address)}; '{self._wiring.board}' may write"
+                f" 0x{first:06x} to 0x{first + SCRATCH_SIZE - WORD:06x}"
+            )
+        if not isinstance(value, int) or not -(1 << 63) <= value < 1 << 63:
+            raise ValueError(f"{value!r}: must be a whole number from -2^63 to 2^63 - 1")
+        self._words[address // WORD] = value
 
     def finish(self) -> None:
         """Record that the program is finished. The board calls this when `run` returns."""

@@ -277,8 +277,9 @@ class EndOfRun:
 
     A run ends at the tick that its config gives. Without such a tick, it ends a fixed time after
     its task: after the status of the level that ends the run reports done or error, or has been
-    missing for too long. The end of the task is determined even if the config gives a tick, because
-    a run that continues this one may end with the task.
+    missing for too long, or after the longest permitted time in lockstep. The end of the task is
+    determined even if the config gives a tick, because a run that continues this one may end with
+    the task.
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
@@ -287,6 +288,7 @@ class EndOfRun:
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._silent = wiring.silent
+        self._longest = wiring.longest or sys.maxsize
         self._heard: int | None = None
         # Under a tick-based protocol, messages become visible only at ticks of the mailbox's grid.
         self._every = 1
@@ -319,7 +321,7 @@ class EndOfRun:
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
                 self._heard = boundary
             is_over = reading.is_new and reading.message.state in (State.DONE, State.ERROR)
-            if is_over or boundary - self._heard >= self._silent:
+            if is_over or boundary - self._heard >= self._silent or tick >= self._longest:
                 self._task_ends = max(boundary + self._linger, tick)
         return self._task_ends if self._stop_tick is None else self._stop_tick
 
@@ -351,6 +353,8 @@ def run_clock(
         one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
         one_at_a_time |= any(len(layout.find_pacers(host)) > 1 for host in layout.hosts)
         driver = LockstepDriver(segment, end_of_run, one_at_a_time, wiring.history, alarms)
+        # A board that is interrupted may miss releases at any tick.
+        driver.permits_batches &= all(mailbox.interrupt is None for mailbox in layout.mailboxes)
         if copier is not None:
             driver.snapshot = ClockCopies(segment, driver, copier)
     else:

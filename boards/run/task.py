@@ -9,6 +9,7 @@ from typing import ParamSpec, TypeVar
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.clock.wake import NextCycle
+from rack.backplane.mailbox.inbox import MAX_PREEMPTED_CYCLES, Work
 from rack.backplane.mailbox.interrupt import BoardInbox, open_inbox
 from rack.backplane.process import busy_wait_until
 from rack.backplane.segment import Segment
@@ -56,9 +57,11 @@ class Task(ABC):
         )
         inbox = open_inbox(segment, wiring.task)
         self.serve: Callable[[int], None] | None = None
+        handler = None
         # The first task of a board serves its interrupts.
         if inbox is not None and wiring.task == segment.layout.find_interrupt_task(spec.slot):
-            self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve_messages
+            handler = InterruptHandler(segment, wiring, inbox, self.alarms)
+            self.serve = handler.serve_messages
         self.inputs = InputPorts(
             segment,
             level,
@@ -75,6 +78,9 @@ class Task(ABC):
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs.apply_faults, level)
         self.simulated = SimulatedTime(segment, spec)
+        # Without a budget, computing takes no simulated time that a handler could preempt.
+        if handler is not None and (wiring.budget_ns or not self.clock.is_lockstep):
+            self.simulated.steps.append(handler.preempt_computing)
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
@@ -188,19 +194,26 @@ class ClockGuard:
 class InterruptHandler:
     """Interrupt handler of a board, under protocol interrupt.
 
-    It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
-    original boards the handler ran whenever a message arrived. In this program, the first task of
-    the board calls the handler before it reads its mailboxes. The handler then uses the processor
-    time for all interrupts since the previous cycle. This adds to the time of reading (t_comm of
-    eq. 3.5), and delays tasks of lower priority on the same core. In lockstep, where no task waits
-    for a processor, the handler takes no time.
+    It counts interrupts, reports lost ones, and takes processor time. On the original boards the
+    handler ran whenever a message arrived, and preempted what the board computed. In this program
+    the first task of the board takes the time of the handler at the end of its computation, before
+    it writes: for the messages that were being served at the release, and for those that have
+    arrived since then. In lockstep this is simulated time, in which the cycle takes its budget, and
+    messages arrive when their writers' cycles and budgets say. Between two computations the handler
+    takes the time of nothing.
     """
 
-    def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
+    def __init__(
+        self, segment: Segment, wiring: TaskWiring, inbox: BoardInbox, alarms: AlarmWriter
+    ) -> None:
         self._inbox = inbox
-        self._block = segment.get_block(task)
-        clock = SystemClock(segment)
-        self._takes_time = not clock.is_lockstep
+        spec = segment.layout.find_task(wiring.task)
+        self._block = segment.get_block(wiring.task)
+        self._clock = clock = SystemClock(segment)
+        self._clock_ns = segment.layout.clock_ns
+        self._budget_ns = wiring.budget_ns
+        self._longest_ns = MAX_PREEMPTED_CYCLES * spec.every * self._clock_ns
+        self._sources = [source for source in inbox.sources if source.is_periodic]
         self._lines = [
             (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()
         ]
@@ -208,22 +221,20 @@ class InterruptHandler:
         inbox.advance_to(clock.tick)
         inbox.inbox.most_waiting = 0
         self._served = inbox.count
-        self._service_ns = inbox.service_ns
+        # Time of the handler that has passed or has been taken.
+        self._taken_ns = inbox.accepted_ns
         self._lost = [line.lost for line in inbox.lines.values()]
         self._cycles = 0
 
     def serve_messages(self, tick: int) -> None:
         """Serve all messages that have arrived up to the release at `tick`."""
         inbox = self._inbox
-        begun_ns = process_time_ns()
         self._cycles += 1
         inbox.advance_to(tick)
+        self._taken_ns = inbox.accepted_ns - max(0, inbox.inbox.free_ns - tick * self._clock_ns)
         if inbox.count != self._served:
             self._block[Block.INTERRUPTS] += inbox.count - self._served
             self._served = inbox.count
-            if self._takes_time:
-                busy_wait_until(begun_ns + inbox.service_ns - self._service_ns)
-            self._service_ns = inbox.service_ns
         if inbox.inbox.most_waiting > self._block[Block.INTERRUPTS_WAITING]:
             self._block[Block.INTERRUPTS_WAITING] = inbox.inbox.most_waiting
         if inbox.inbox.lost != sum(self._lost):
@@ -233,6 +244,32 @@ class InterruptHandler:
                     self._lost[at] = line.lost
                     self._block[Block.INTERRUPTS_LOST] += lost
                     episodes.record_finding(Alarm.INBOX_FULL, self._cycles, tick, lost)
+
+    def preempt_computing(self, tick: int, begin_ns: int, end_ns: int) -> int:
+        """Return the end of a computation that the handler preempts. In real time, take the time.
+
+        This is a `rack.boards.run.simulated_time.FinishStep`.
+
+        Args:
+            tick: Release tick of the cycle.
+            begin_ns: Begin of the cycle.
+            end_ns: End of the cycle without its budget and the handler.
+        """
+        inbox = self._inbox
+        if self._clock.is_lockstep:
+            time_ns = self._budget_ns + end_ns - begin_ns
+            work = Work(begin_ns, time_ns, begin_ns + time_ns + self._longest_ns)
+            return inbox.inbox.compute_end(work, self._sources, tick * self._clock_ns)
+        begun_ns = process_time_ns()
+        taken_ns = 0
+        while taken_ns < self._longest_ns:
+            inbox.collect_arrivals(self._clock.compute_simulated_ns())
+            if self._taken_ns >= inbox.accepted_ns:
+                break
+            taken_ns += inbox.accepted_ns - self._taken_ns
+            self._taken_ns = inbox.accepted_ns
+            busy_wait_until(begun_ns + taken_ns)
+        return end_ns
 
 
 def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:

@@ -56,7 +56,7 @@ class Forecast:
             system=predict_response(rack),
             verdicts=tuple(evaluate_rack(rack)),
             inboxes=tuple(
-                inbox.to_document(rack.find_slice_ticks(name) * rack.clock_ns)
+                inbox.to_document(rack.compute_interrupted_ns(name))
                 for name, inbox in rack.inboxes.items()
             ),
             frames=compute_core_frames(rack),

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import lcm
 from typing import Any
 
-from rack.backplane.mailbox.inbox import Burst, InterruptSource, compute_burst
+from rack.backplane.mailbox.inbox import (
+    MAX_PREEMPTED_CYCLES,
+    Burst,
+    Inbox,
+    InterruptSource,
+    Work,
+    compute_burst,
+)
+
+MAX_ARRIVALS = 20_000
+"""Largest number of messages that are simulated, until their arrivals repeat."""
 
 
 @dataclass(frozen=True)
@@ -19,35 +30,73 @@ class InboxTiming:
             time, in the same order. The model assumes that each mailbox is written in every cycle
             of its writer.
         depth: Largest number of pending interrupts.
+        period_ns: Time between two computations of the task.
+        first_ns: Time of the first of them.
+        due_ns: Time after its begin at which a computation must have ended.
     """
 
     task: str
     mailboxes: tuple[str, ...]
     sources: tuple[InterruptSource, ...]
     depth: int
+    period_ns: int
+    first_ns: int
+    due_ns: int
 
-    def compute_cost_ns(self, span_ns: int) -> int:
-        """Return the worst-case total processor time, in ns, of interrupts within `span_ns`.
+    def compute_cost_ns(self, time_ns: int) -> int:
+        """Return the longest time in ns that handlers take from a computation of `time_ns`.
 
-        These are the interrupts that arrive in an interval of this length.
+        It follows from the times at which the messages arrive. If these are not known or repeat
+        only after a very long time, all messages are assumed to arrive when the computation begins.
         """
-        return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
+        if not time_ns:
+            return 0
+        whole_ns = lcm(self.period_ns, *(source.every_ns for source in self.sources))
+        longest_ns = MAX_PREEMPTED_CYCLES * self.period_ns
+        events = sum(whole_ns // each.every_ns for each in self.sources)
+        if events > MAX_ARRIVALS or not all(source.is_periodic for source in self.sources):
+            return self._bound_cost_ns(time_ns, longest_ns)
+        # After the latest first message, everything repeats.
+        settled_ns = max(self.first_ns, *(source.at_ns for source in self.sources)) + whole_ns
+        inbox = Inbox(self.depth)
+        since_ns = -1
+        worst_ns = 0
+        begin_ns = self.first_ns
+        while begin_ns < settled_ns + whole_ns:
+            inbox.add_arrivals(self.sources, since_ns, begin_ns)
+            since_ns = begin_ns
+            work = Work(begin_ns, time_ns, begin_ns + time_ns + longest_ns)
+            end_ns = inbox.compute_end(work, self.sources, begin_ns)
+            worst_ns = max(worst_ns, end_ns - begin_ns - time_ns)
+            begin_ns += self.period_ns
+        return worst_ns
+
+    def _bound_cost_ns(self, time_ns: int, longest_ns: int) -> int:
+        """Return an upper bound for the cost of interrupts, but no more than `longest_ns`."""
+        cost_ns = 0
+        while cost_ns < longest_ns:
+            span_ns = time_ns + cost_ns
+            needed_ns = sum(s.service_ns * -(-span_ns // s.every_ns) for s in self.sources)
+            if needed_ns == cost_ns:
+                break
+            cost_ns = needed_ns
+        return min(cost_ns, longest_ns)
 
     @property
     def burst(self) -> Burst:
         """Worst case, in which all sources send at the same time."""
         return compute_burst(self.sources)
 
-    def to_document(self, cycle_ns: int) -> dict[str, Any]:
+    def to_document(self, cost_ns: int) -> dict[str, Any]:
         """Return the worst case as plain data for JSON.
 
-        `cycle_ns` is the task's cycle, or the time slice of its plan, in ns.
+        `cost_ns` is the longest time that interrupts take from a computation, in ns.
         """
         burst = self.burst
         return {
             "task": self.task,
             "mailboxes": list(self.mailboxes),
-            "cycle_cost_ns": self.compute_cost_ns(cycle_ns),
+            "cycle_cost_ns": cost_ns,
             "load": burst.load,
             "depth": self.depth,
             "waiting": burst.waiting,

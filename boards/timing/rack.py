@@ -168,8 +168,8 @@ class RackTiming:
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
             longest_cycle_ns=round(self.longest_cycles[board] * self.tick_ns),
-            read_ns=budget.read_ns + self.compute_interrupted_ns(board),
-            execution_ns=budget.process_ns,
+            read_ns=budget.read_ns,
+            execution_ns=budget.process_ns + self.compute_interrupted_ns(board),
             write_ns=budget.write_ns,
             exchange_ns=table.exchange_ns,
             plan_ns=plan_ns if has_plan else None,
@@ -179,18 +179,29 @@ class RackTiming:
         )
 
     def compute_interrupted_ns(self, task: str) -> int:
-        """Return the processor time in ns that interrupts take during one cycle or plan of a task.
+        """Return the time in ns that interrupts take from one computation of a task.
 
-        It is 0 if the task does not serve an inbox.
+        It is 0 if the task does not serve an inbox or has no budget.
         """
-        if task not in self.inboxes:
-            return 0
-        return self.inboxes[task].compute_cost_ns(self.find_slice_ticks(task) * self.clock_ns)
+        return self._interrupted_ns.get(task, 0)
 
-    def find_slice_ticks(self, task: str) -> int:
-        """Return the cycle of an executor, or the time slice of a planner's plan, in ticks."""
+    @cached_property
+    def _interrupted_ns(self) -> dict[str, int]:
+        """Time that interrupts take from one computation of each task that serves an inbox."""
+        return {
+            task: inbox.compute_cost_ns(self.find_busy_ns(task))
+            for task, inbox in self.inboxes.items()
+        }
+
+    def find_busy_ns(self, task: str) -> int:
+        """Return the budget of a task's cycle or plan in ns, without interrupts. 0 without one."""
         board = self.boards[task.removesuffix(".planner")]
-        return board.every * (1 if task == board.name else board.within_cycles)
+        budget = board.budget
+        if budget is None:
+            return 0
+        if task != board.name:
+            return budget.plan_ns + budget.update_ns
+        return board.exchange_ns + budget.read_ns + budget.process_ns + budget.write_ns
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
@@ -225,8 +236,8 @@ class RackTiming:
             phase_ns=board.phase * self.tick_ns,
             parts=_drop_empty_parts(
                 Part(Unit.EXCHANGE, board.exchange_ns),
-                Part(Unit.READ, budget.read_ns + self.compute_interrupted_ns(board.name)),
-                Part(Unit.PROCESS, budget.process_ns),
+                Part(Unit.READ, budget.read_ns),
+                Part(Unit.PROCESS, budget.process_ns + self.compute_interrupted_ns(board.name)),
                 Part(Unit.WRITE, budget.write_ns),
             ),
         )

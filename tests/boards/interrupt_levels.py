@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from time import process_time_ns
+
 import numpy as np
 
 from rack.backplane.message import Message, State, Status, field
+from rack.backplane.process import busy_wait_until
 from rack.levels.level import Executor, Inputs, Output
 from rack.levels.systems.figures import FigureStatus
 
@@ -33,6 +36,7 @@ class Hub(Executor):
     command = Output(Order)
 
     def process(self, tick: int) -> None:
+        busy_wait_until(process_time_ns() + self.context.params.get("compute_ns", 0))
         self.status.state = State.EXECUTING
         for at, reading in enumerate(self.below.values()):
             self.status.cycle[at] = reading.message.cycle if reading.has_message else -1

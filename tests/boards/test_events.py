@@ -131,6 +131,17 @@ def test_a_level_that_is_silent_for_too_long_has_failed_unless_it_is_done(
     assert ending(bus).find_final_state() == (state.name.lower(), reason)
 
 
+@pytest.mark.parametrize(
+    ("longest", "cause"), [(0, "time over"), (7, "time over"), (6, "task failed")]
+)
+def test_a_run_that_lasted_too_long_has_failed(bus: Segment, longest: int, cause: str) -> None:
+    write(bus, "upper.status", 5, state=State.HOLDING, moves=1, reason="waiting")
+    bus.words[System.TICK] = 6
+    found = Ending(bus, "upper.status", SILENT, longest)
+    assert found.find_cause() == cause
+    assert ("lockstep_end_s: waiting" in found.find_final_state()[1]) == (cause == "task failed")
+
+
 def test_a_level_that_never_wrote_is_silent_from_the_start(bus: Segment) -> None:
     bus.words[System.TICK] = SILENT
     assert ending(bus).find_cause() == "time over"

@@ -8,6 +8,7 @@ import os
 import runpy
 import signal
 import sys
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 from rack.backplane.segment import Segment
 from rack.boards.config.loader import load_text
 from rack.boards.config.resolved import resolve
+from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
@@ -37,7 +39,8 @@ def prompt(
 
     The prompt runs as the process of a host board with `external = true`. A board can have only one
     such process at a time. The name `program` is the board's program, whose ports read and send
-    messages, and `bus` gives the time and waits for messages. The program may define more names.
+    messages, and `bus` gives the time, waits for messages, reads the crate's memory by address and
+    writes the scratch words of the board. The program may define more names.
     Nothing that happens at the prompt delays the real-time side. The prompt can be closed and
     opened again while the rack runs. The rack must belong to you, because the prompt runs a class
     that the rack's config names.
@@ -102,13 +105,27 @@ def _use_python_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+class Prompt(code.InteractiveConsole):
+    """Python prompt that prints an error inside a call of a name that it offers in one line."""
+
+    def showtraceback(self) -> None:
+        """Print the exception that was just raised."""
+        error = sys.exc_info()[1]
+        frames = traceback.extract_tb(error.__traceback__) if error is not None else []
+        if isinstance(error, ValueError | LookupError) and frames[-1].filename != self.filename:
+            self.write(f"{to_one_line(str(error), MAX_REASON_LENGTH)}\n")
+        else:
+            super().showtraceback()
+
+
 def _open_prompt(rack: str, board: str, names: dict[str, Any]) -> None:
     """Open a prompt in which `names` are defined."""
     with contextlib.suppress(ImportError):
         import readline  # noqa: F401  line editing and history
 
     names_text = ", ".join(names)
-    code.interact(f"rack {rack}, host board '{board}': {names_text}", local=names, exitmsg="")
+    banner = f"rack {rack}, host board '{board}': {names_text}; help(NAME) explains a name"
+    Prompt(names).interact(banner, exitmsg="")
 
 
 def _run_script(script: Path, names: dict[str, Any]) -> None:

@@ -376,16 +376,18 @@ def find_end(strike: Strike) -> int:
 
 def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     """Evaluate the faults in the recorded events of a run and return the results for its report."""
-    events = [Event(**event) for event in recorded if "tick" in event]
+    own_events = [Event(**event) for event in recorded if "tick" in event]
     outcome: Mapping[str, Any] = next(
         (event for event in recorded if event["kind"] == "outcome"), {}
     )
+    # Faults that acted before a run continues another one may have been detected there.
+    events = [*(Event(**event) for event in outcome.get("earlier", ())), *own_events]
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(outcome.get("faults", ()))
-    is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
+    is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in own_events)
     verdict = judge_faults(
         strikes, events, Circumstances(layout, outcome.get("clock_offset_ns", 0), is_lockstep)
     )
-    restarts = Counter(event.board for event in events if event.code == "restart")
+    restarts = Counter(event.board for event in own_events if event.code == "restart")
     return {
         # Faults that never acted come last.
         "faults": [
@@ -402,6 +404,7 @@ def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Repo
                 "text": event.text,
             }
             for event in verdict.unexplained
+            if event in own_events
         ],
         "restarts": dict(restarts),
     }

@@ -30,6 +30,7 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import build_cell_config
 from rack.boards.crate.requests import Preload
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX
+from rack.boards.events import OF_LAUNCH, Event
 from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
@@ -182,8 +183,13 @@ class RepeatedRun:
         """Return the state from which a rack can continue at `tick`."""
         self.reach_tick(tick)
         run = self.recording
-        origin = Origin(str(run.folder), tick, run.launch.created_ns)
-        return replace(self._find_beginning(tick), origin=origin)
+        events = (*run.end_counts.get("earlier", ()), *run.events)
+        earlier = (Event(**event) for event in events if 0 <= event.get("tick", -1) < tick)
+        return replace(
+            self._find_beginning(tick),
+            origin=Origin(str(run.folder), tick, run.launch.created_ns),
+            earlier=tuple(event for event in earlier if event.kind not in OF_LAUNCH),
+        )
 
     def read_levels(self, tick: int) -> dict[str, Document]:
         """Return a dictionary from task to the attributes of its level's object before `tick`."""

@@ -66,6 +66,7 @@ class Beginning:
         entries: Recorded messages of host boards and other racks, which are not started in that
             case.
         origin: The run that is continued, to be recorded.
+        earlier: Events of that run before this state.
     """
 
     continues: Continuation | None = None
@@ -73,6 +74,7 @@ class Beginning:
     requests: tuple[Request, ...] = ()
     entries: Mapping[str, RecordedEntries] | None = None
     origin: Origin | None = None
+    earlier: tuple[Event, ...] = ()
 
 
 FROM_START = Beginning()
@@ -93,6 +95,7 @@ class RunResult:
             full.
         others: Racks that were launched with this one.
         failed: Which of these other racks failed, and why. Empty if none did.
+        earlier: Events of the continued run before this one. Faults may have been detected there.
     """
 
     rack: str
@@ -107,6 +110,7 @@ class RunResult:
     refused: dict[str, int]
     others: tuple[OtherRackEnd, ...] = ()
     failed: str = ""
+    earlier: tuple[Event, ...] = ()
 
     @property
     def worked(self) -> bool:
@@ -173,6 +177,7 @@ def run_rack(
                     requests=beginning.requests,
                 )
             )
+            rack.events.extend(beginning.earlier)
             segment = rack.segment
             segment.words[System.HOLD_AT] = int(step)
             news: list[News] = []
@@ -212,6 +217,7 @@ def run_rack(
             build_result(segment, config, outcome, wall_s, recording, rows_lost),
             others=others.list_ends(),
             failed=failed,
+            earlier=beginning.earlier,
         )
         log.write_outcome(asdict(result))
         cut_off = replace(result, recording="events.jsonl ends before the run")

@@ -115,7 +115,7 @@ class ServerWork(RequestWork):
             reason: Reason to report.
             code: Error code to report.
         """
-        self._fail_request(how, reason, code)
+        self.fail_request(how, reason, code)
         self.motion.ramp_to_rest()
 
     def end_compliance(self) -> None:

@@ -42,8 +42,10 @@ from rack.levels.systems.hand.messages import (
     GraspPlan,
     GraspStatus,
     GraspTarget,
+    HostWords,
 )
 
+N_PER_MN = 1e-3
 PLANNED = "planned"
 """Name of the posture that a plan defines."""
 NO_WORLD = "no world model: waiting for where the object is"
@@ -57,12 +59,14 @@ class GraspExecutor(Executor):
     fingers keep their targets and forces in the meantime. A step that fails or is suspended for too
     long ends the program with an error, and the fingers stay as they are. With a planner above, the
     newest plan defines the posture before a CLOSE step, the target points of that step, and the
-    grip force after it. After a restart the level continues from its own last messages.
+    grip force after it. A workstation above may add to the grip force. After a restart the level
+    continues from its own last messages.
     """
 
     fingers = Inputs(FingerStatus, "below.status")
     world = Input(WorldState, "world.model")
     plan = Inputs(GraspPlan, "above.plan", optional=True)
+    words = Inputs(HostWords, "above.words", optional=True)
     last_command = Input(GraspTarget, "own.command")
     last_status = Input(GraspStatus, "own.status")
     operator = OPERATOR
@@ -136,6 +140,9 @@ class GraspExecutor(Executor):
         grasp = self._grasp
         self._orders.take_commands(self.operator)
         grasp.fingers.read_statuses(self.fingers)
+        for reading in self.words.values():
+            added_n = float(reading.message.word[0]) * N_PER_MN
+            grasp.added = min(max(added_n, -grasp.params.most_added), grasp.params.most_added)
         if self.world.message.revision:
             # Find the object in the world model.
             close = self._find_close_step()

@@ -29,7 +29,7 @@ from rack.levels.systems.hand.grasp_program import (
 )
 from rack.levels.systems.hand.grip import GripGains, HandGrip
 from rack.levels.systems.hand.messages import FingerMode, FingerStatus, GraspTarget
-from rack.levels.tables import Positive, Table
+from rack.levels.tables import NotNegative, Positive, Table
 
 SLIPPED_PART = 0.2
 """Fraction of the touch force below which a tip no longer counts as touching."""
@@ -89,6 +89,8 @@ class GraspParams(GripGains):
     """time beyond its duration after which a step has failed [s]"""
     stalled: Positive = 60.0
     """duration of a suspension, except holds of an operator, that fails the program [s]"""
+    most_added: NotNegative = 3.0
+    """largest force that a workstation above may add to the grip force or take from it [N]"""
     lost: Positive = 0.2
     """time without contact after which a finger has lost the object [s]"""
     tolerance: Positive = 0.02
@@ -113,6 +115,7 @@ class Grasp:
     touching: Mask  # (fingers,)
     close: CloseStep | None = None  # the step that gripped the object
     base: float = 0.0  # N: grip force without a load
+    added: float = 0.0  # N: added to it by a workstation
     object: Pose | None = None  # sensed pose
     anchor: Array = field(default_factory=lambda: np.zeros(3))  # m: target position of the object
     moved: float = 0.0  # m: distance of the object from its anchor
@@ -295,7 +298,7 @@ class GrippingWork(StepWork):
         grasp.farthest = max(grasp.farthest, grasp.moved)
         grasp.grip.follow_creep(grasp.target.tip, fingers.tip)
         grasp.grip.correct_position(away)
-        grasp.grip.adapt_force(grasp.base, fingers.force)
+        grasp.grip.adapt_force(max(grasp.base + grasp.added, 0.0), fingers.force)
         self.apply_grip()
 
     def apply_grip(self) -> None:

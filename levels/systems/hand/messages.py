@@ -13,7 +13,7 @@ from enum import IntEnum
 
 from numpy import ndarray
 
-from rack.backplane.message import field, integer_field
+from rack.backplane.message import Message, field, integer_field
 from rack.backplane.words import Demand
 from rack.levels.messages import joint_field
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
@@ -208,6 +208,17 @@ class GraspPlan(RelayedCommand, version=1):
     )
     grip: float = field(
         unit="N", doc="force of each finger except the opposing one, which bears their sum"
+    )
+
+
+class HostWords(Message, version=1):
+    """Words that a workstation has written into the crate's memory."""
+
+    word: ndarray = field(
+        "i8",
+        unit="1",
+        doc="scratch words; 0: force in mN that is added to the grip force, the others are free",
+        shape=8,
     )
 
 

@@ -2,7 +2,8 @@
 
 It reads messages and sends plans through the bus adapter. The cycle counts of the boards are not in
 any message, so the prompt reads them from the crate's memory at their bus addresses. The boards may
-write them at the same time, even in lockstep.
+write them at the same time, even in lockstep. The prompt also writes scratch words of the crate's
+memory, of which a message tells the boards.
 
 In a grasp, one finger opposes all others: the fingers press along one line from one side, and the
 opposing finger presses from the other side. The planner tries lines in all directions across the
@@ -26,12 +27,12 @@ from pydantic import Field
 from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
+from rack.levels.host_program import Bus, HostProgram, HostSender, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, build_level_cell
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
+from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus, HostWords
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LINES = 72
@@ -235,6 +236,19 @@ class GraspPlanner:
 MOVED_M = 0.003
 """Displacement of the object after which a new plan is made."""
 WORD = 8
+WORDS = 8
+"""Number of scratch words of the workstation, as in `HostWords`."""
+
+
+class WordWrite(Table):
+    """`[[host.<name>.params.writes]]`: a word that the workstation writes."""
+
+    at: NotNegative
+    """simulated or real time from the first check after which it is written [s]"""
+    word: int = Field(ge=0, lt=WORDS)
+    """number of the scratch word"""
+    value: int = Field(ge=-(1 << 63), lt=1 << 63)
+    """value, a signed 64-bit integer"""
 
 
 class WorkstationParams(Table):
@@ -248,6 +262,8 @@ class WorkstationParams(Table):
     """requirements on the grasp"""
     every_s: Positive = 0.2
     """longest time between two checks of the object's position [s]"""
+    writes: tuple[WordWrite, ...] = ()
+    """words that the program writes into the crate's memory, each at its time"""
 
 
 class Workstation(HostProgram):
@@ -256,6 +272,7 @@ class Workstation(HostProgram):
     world = ProgramInput(WorldState, "below.world")
     grasp = ProgramInput(GraspStatus, "below.grasp")
     plan = ProgramOutput(GraspPlan)
+    words = ProgramOutput(HostWords)
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -271,10 +288,15 @@ class Workstation(HostProgram):
         self._at = np.full(3, np.inf)  # (3,), m: position of the object in the newest plan
 
     def run(self, bus: Bus) -> None:
-        """Plan grasps until the run is over."""
+        """Plan grasps and write words until the run is over."""
+        due = sorted(self._params.writes, key=lambda write: write.at)
+        start_s = bus.time_s
         while not bus.is_over:
             bus.wait(self._params.every_s)
             self.plan_grasp()
+            while due and bus.time_s - start_s >= due[0].at:
+                write = due.pop(0)
+                CrateMemory(bus, self.words).write(bus.scratch + WORD * write.word, write.value)
 
     def plan_grasp(self) -> PlannedGrasp | None:
         """Plan and send a grasp if the object has moved and is not being gripped yet.
@@ -309,16 +331,53 @@ class Workstation(HostProgram):
 
     def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
         """Return a dictionary from names to the functions that a prompt offers."""
+        memory = CrateMemory(bus, self.words)
         return {
             "plan": self.plan_grasp,
-            "boards": lambda: self.read_counts(bus),
+            "boards": memory.boards,
+            "words": memory.words,
+            "write": memory.write,
         }
 
-    def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
+
+class CrateMemory:
+    """Access of the workstation to the crate's memory, by bus address.
+
+    Args:
+        bus: The bus.
+        sender: Output that tells the levels of written words.
+    """
+
+    def __init__(self, bus: Bus, sender: HostSender[HostWords]) -> None:
+        self._bus = bus
+        self._sender = sender
+
+    def boards(self) -> dict[str, dict[str, int]]:
         """Return the cycle counts of every task, read from its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
-        blocks = {task: bus.address(task) for task in bus.tasks}
+        blocks = {task: self._bus.address(task) for task in self._bus.tasks}
         return {
-            task: {name: bus.words(address + WORD * word)[0] for name, word in counts.items()}
+            task: {name: self._bus.words(address + WORD * word)[0] for name, word in counts.items()}
             for task, address in blocks.items()
         }
+
+    def words(self) -> dict[str, int]:
+        """Return the values of the words that `write` may change, by their addresses."""
+        first = self._bus.scratch
+        values = enumerate(self._bus.words(first, WORDS))
+        return {f"0x{first + WORD * word:06x}": value for word, value in values}
+
+    def write(self, address: int, value: int) -> None:
+        """Write one of the words that `words` lists, and send all of them to the levels.
+
+        Raises:
+            ValueError: The word may not be written, the value is no 64-bit integer, or too many
+                messages wait at the adapter.
+        """
+        bus = self._bus
+        before = bus.words(address)
+        bus.write(address, value)
+        self._sender.message.word[:] = bus.words(bus.scratch, WORDS)
+        if not self._sender.send():
+            bus.write(address, *before)
+            raise ValueError("too many words wait at the adapter; try again later")

@@ -14,7 +14,7 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import OPERATOR, Executor, Input, Inputs, LevelContext, Output, Reading
-from rack.levels.messages import WorldState
+from rack.levels.messages import Error, WorldState
 from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
@@ -28,6 +28,7 @@ from rack.levels.systems.trajectory.messages import (
     MotionRequest,
     MotionState,
     MotionStatus,
+    RequestEnd,
 )
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork, TrajectoryParams
@@ -86,6 +87,9 @@ class TrajectoryExecutor(Executor):
         if robot.gripper is not None:
             self._work.grip = robot.gripper.open, robot.gripper.force
         self._last_tick: int | None = None  # of the last cycle; None before the first one
+        self._stalled_s = params.stalled
+        self._waiting_id = 0  # request whose waits are added up
+        self._waited_s = 0.0
         # Numbers of requests on which the last saved state depends.
         self._saved_ids: tuple[int, ...] = ()
 
@@ -120,6 +124,7 @@ class TrajectoryExecutor(Executor):
             if self._boards.in_step:
                 due_tick = self._compute_due_tick(tick) - late_cycles * self.context.every
                 self._work.step(due_tick * self.context.tick_s, hold)
+        self._limit_waiting()
         self._write_reference(self.command, tick)
         self._write_status(self.status)
         agenda = self._agenda
@@ -152,6 +157,24 @@ class TrajectoryExecutor(Executor):
             self._motion.rest_at(self._boards.position)
         elif was_in_step and not self._boards.in_step:
             self._work.interrupt_motion()
+
+    def _limit_waiting(self) -> None:
+        """Fail a request that has waited for too long in total.
+
+        A boards' hold may end and begin again for ever, so single waits are added up.
+        """
+        agenda = self._agenda
+        first_id = agenda.held[0].id if agenda.held else agenda.taken + 1
+        if first_id != self._waiting_id:
+            self._waiting_id = first_id
+            self._waited_s = 0.0
+        has_work = agenda.held or agenda.is_request_missing
+        is_stopped = self._orders.is_in_force or self.demand
+        if has_work and not is_stopped and (reason := self._find_wait_reason()):
+            self._waited_s += self.context.period_s
+            if self._waited_s > self._stalled_s and not agenda.error:
+                why = f"waited for {self._stalled_s:g} s: {reason}"
+                self._work.fail_request(RequestEnd.FAILED, why, Error.STALLED)
 
     def _check_guard(self, cycles: int) -> None:
         """End the current request if its touch guard detects a contact.

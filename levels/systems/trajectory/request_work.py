@@ -39,6 +39,9 @@ class TrajectoryParams(Table):
     """longest time for which the motion of a body is extrapolated [s]"""
     handover: int = Field(HANDOVER_CYCLES, ge=1, le=1000)
     """cycles after the first set point until statuses must show that it is followed"""
+    stalled: Positive = 90.0
+    """time for which a request may wait in total until it fails; waits for an operator or for the
+    end of a required stop do not count [s]"""
 
 
 class MotionTools(NamedTuple):
@@ -114,7 +117,7 @@ class RequestWork:
                 self.goal.update_pose(time_s + self._tools.period_s)
             motion.advance_to(time_s)
         except InfeasibleMotion as error:
-            self._fail_request(RequestEnd.FAILED, str(error), Error.LIMIT)
+            self.fail_request(RequestEnd.FAILED, str(error), Error.LIMIT)
         if hold:
             if motion.leg is not None:
                 self.interrupt_motion()
@@ -141,7 +144,7 @@ class RequestWork:
             return 1.0 - self._remaining_fraction
         return 1.0 - self._remaining_fraction * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
-    def _fail_request(self, outcome: RequestEnd, reason: str, code: Error) -> None:
+    def fail_request(self, outcome: RequestEnd, reason: str, code: Error) -> None:
         """End the current request with an error and cancel the others.
 
         Args:
@@ -234,7 +237,7 @@ class RequestWork:
         self.passed_s = 0.0
         self._remaining_fraction = 1.0
         if reason := self._find_request_error(request):
-            self._fail_request(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
+            self.fail_request(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
             self.motion.ramp_to_rest()
         elif request.kind in MOVING_KINDS:
             self._begin_leg(request, half_s, request.segment)
@@ -279,4 +282,4 @@ class RequestWork:
             self.motion.begin_leg(build_leg, half_s)
             self.goal = goal
         except InfeasibleMotion as error:
-            self._fail_request(RequestEnd.REFUSED, str(error), Error.UNREACHABLE)
+            self.fail_request(RequestEnd.REFUSED, str(error), Error.UNREACHABLE)

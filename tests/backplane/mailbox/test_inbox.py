@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.backplane.mailbox.inbox import Inbox, InterruptSource, compute_burst
+from rack.backplane.mailbox.inbox import Inbox, InterruptSource, Work, compute_burst
 
 ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=60)
 """Pauses before messages, and their services."""
@@ -38,6 +38,35 @@ def test_no_two_services_overlap_and_no_more_wait_than_permitted(
         assert end - took == max(arrived, before)
     assert inbox.lost == len(pauses) - len(served)
     assert inbox.most_waiting <= depth
+
+
+SOURCES = st.lists(
+    st.builds(InterruptSource, st.integers(4, 40), st.integers(0, 12), st.integers(0, 50)),
+    max_size=4,
+)
+LIMIT = 400
+
+
+@given(SOURCES, st.integers(1, 4), st.integers(0, 60), st.integers(1, 40))
+def test_a_computation_runs_whenever_the_handler_is_idle(
+    sources: list[InterruptSource], depth: int, begin: int, time: int
+) -> None:
+    inbox, busy = Inbox(depth), set[int]()
+    arrivals = sorted(
+        (at, number, source.service_ns)
+        for number, source in enumerate(sources)
+        for at in range(source.at_ns, 2 * LIMIT, source.every_ns)
+    )
+    for at, _, service in arrivals:
+        if (end := inbox.add_message(at, service)) is not None:
+            busy.update(range(end - service, end))
+    idle = [at for at in range(begin, 2 * LIMIT) if at not in busy]
+    expected = 1 + idle[time - 1] if len(idle) >= time else LIMIT
+    known = Inbox(depth)
+    known.add_arrivals(sources, -1, begin)
+    found = known.compute_end(Work(begin, time, LIMIT), sources, begin)
+    assert found == min(expected, LIMIT)
+    assert known.compute_end(Work(begin, time, LIMIT), sources, begin) == found
 
 
 def test_a_burst_of_all_senders_waits_for_each_other() -> None:

@@ -125,7 +125,7 @@ def test_a_message_served_across_a_release_is_visible_at_the_next(make_bus: Make
     # The sender in the lowest slot comes first.
     assert board.read(1) == {"third": 0, "second": 0}
     assert board.read(2) == {"first": 0}
-    assert (board.inbox.count, board.inbox.service_ns) == (3, 2_700_000)
+    assert (board.inbox.count, board.inbox.accepted_ns) == (3, 2_700_000)
 
 
 def test_a_full_inbox_loses_the_last_messages_at_this_board_only(make_bus: MakeBus) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
@@ -111,6 +112,42 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
             bus.words(wrong, count)
     with pytest.raises(LookupError, match="nothing on the bus is called 'x'; known: "):
         bus.address("x")
+
+
+def test_a_program_writes_scratch_words_of_its_board_alone(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
+    site = make_site()
+    bus = open_bus(site)
+    places = site.segment.map
+    for number, value in enumerate((7, -(1 << 63), (1 << 63) - 1)):
+        bus.write(bus.scratch + WORD * number, value)
+    assert bus.words(bus.scratch, 4) == [7, -(1 << 63), (1 << 63) - 1, 0]
+    before = bytes(site.segment.get_bytes(0, places.size))
+    for address, value, why in (
+        (bus.scratch + 1, 1, "addresses must be multiples of 8"),
+        (places.size, 1, "the bus has 0 to"),
+        (-WORD, 1, "the bus has 0 to"),
+        ("a", 1, "'a': addresses and counts must be integers"),
+        (bus.scratch, 1.5, "1.5: must be a whole number from -2^63 to 2^63 - 1"),
+        (bus.scratch, 1 << 63, "9223372036854775808: must be a whole number"),
+        (WORD * System.TICK, 1, "belongs to the words of the Rack and the system clock;"),
+        (bus.address("adder"), 1, "belongs to the control block of 'adder'; 'program' may write"),
+        (
+            bus.address("adder.status"),
+            1,
+            "to mailbox 'adder.status', whose messages have checksums",
+        ),
+        (places.operator, 1, "belongs to the operator table"),
+        (places.alarms["clock"], 1, "belongs to the alarms of 'clock'"),
+        (places.traces["adder"] + WORD, 1, "belongs to the trace of 'adder'"),
+        (places.wake["adder"], 1, "belongs to a semaphore"),
+        (bus.scratch - WORD, 1, "belongs to a semaphore"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(why)) as error:
+            bus.write(address, value)  # type: ignore[arg-type]
+        assert "\n" not in str(error.value)
+    assert bytes(site.segment.get_bytes(0, places.size)) == before
 
 
 def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(

@@ -10,7 +10,9 @@ import pytest
 
 from rack.backplane.words import Block
 from rack.boards import Rack
+from rack.boards.config import build_rack_timing, resolve_layout
 from rack.boards.faults.config import FaultConfig
+from rack.boards.timing.verdicts import PREEMPTED, evaluate_rack
 from tests.boards.conftest import MakeConfig
 from tests.boards.interrupt_levels import BOARDS
 from tests.boards.messages import Written
@@ -153,8 +155,77 @@ def test_faulty_messages_take_the_same_service_time_in_every_run(config: MakeCon
     assert first.cycle[-1, 3] == TICKS - 2
 
 
-def test_in_real_time_interrupts_take_the_reading_boards_processor(config: MakeConfig) -> None:
-    found = run(config, "clock.mode=realtime", "clock.speed=0.5")
-    cycles, served = found.written.cycles["hub"], found.counts[0]
-    reading_ns = (cycles["read_ns"] - cycles["plan_ns"]).sum()
-    assert reading_ns >= served * found.service_ns > 0
+BUDGET = "board.hub.budget.process_ms=1.5"
+LONG = "protocol.interrupt.fixed_us=300"
+"""Five messages that come during a computation of 1.5 ms make it longer than a tick."""
+
+
+class Cycles(NamedTuple):
+    """What a run of the hub has done: missed and skipped releases, and its late events."""
+
+    digest: str
+    cycles: int
+    missed: int
+    skipped: int
+    late: tuple[str, ...]
+
+
+def cycle(config: MakeConfig, *settings: str) -> Cycles:
+    with Rack(config(*settings, text=RACK)) as rack:
+        outcome = rack.run(SECONDS)
+        block = rack.segment.get_block("hub")
+        late = tuple(event.code for event in rack.events if event.code in ("late", "starved"))
+        counts = (block[word] for word in (Block.CYCLES, Block.MISSED, Block.SKIPPED))
+        return Cycles(outcome.digest, *counts, late)
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_late"),
+    [((), False), ((BUDGET,), False), ((LONG,), False), ((BUDGET, LONG), True)],
+)
+def test_handlers_take_their_time_from_the_computation_as_predicted(
+    config: MakeConfig, settings: tuple[str, ...], is_late: bool
+) -> None:
+    first, second = cycle(config, *settings), cycle(config, *settings)
+    assert first == second
+    rack = config(*settings, text=RACK)
+    found = evaluate_rack(build_rack_timing(rack, resolve_layout(rack)))
+    preempted = [verdict for verdict in found if verdict.equation == PREEMPTED]
+    assert [verdict.holds for verdict in preempted] == [not is_late] * (BUDGET in settings)
+    assert bool(first.missed) == is_late
+    assert first.cycles + first.skipped in (TICKS, TICKS - is_late)
+    if is_late:
+        interrupt = resolve_layout(rack).find_mailbox("figure0.status").interrupt
+        assert interrupt is not None
+        # The messages of the next tick come before the computation ends.
+        handlers_ns = BOARDS * interrupt.service_ns
+        assert preempted[0].left == 1.5e6 + 2 * handlers_ns
+        # What the handlers leave of each tick suffices for a part of a computation.
+        part = (2.5e6 - handlers_ns) / 1.5e6
+        assert first.missed == first.cycles == pytest.approx(part * TICKS, abs=2)
+        assert first.late == ("late",)
+
+
+def test_a_message_that_comes_between_computations_takes_no_time(config: MakeConfig) -> None:
+    # Sent 0.5 ms after the release, when the hub has finished.
+    rack = config("board.hub.budget.process_ms=0.4", LONG, text=RACK)
+    timing = build_rack_timing(rack, resolve_layout(rack))
+    assert timing.compute_interrupted_ns("hub") == 0
+    longer = config("board.hub.budget.process_ms=0.6", LONG, text=RACK)
+    assert build_rack_timing(longer, resolve_layout(longer)).compute_interrupted_ns("hub") > 1.5e6
+
+
+def test_in_real_time_interrupts_take_the_time_of_the_computation(config: MakeConfig) -> None:
+    slow = "clock.speed=0.25"  # a tick lasts 10 ms, so messages come 2 ms after the release
+    found = run(config, "clock.mode=realtime", slow, LONG, "board.hub.params.compute_ns=4000000")
+    cycles = found.written.cycles["hub"]
+    computing_ns = cycles["process_ns"] - cycles["read_ns"]
+    # Most cycles are complete, whatever else the machine does.
+    assert np.median(computing_ns) >= 4e6 + BOARDS * found.service_ns
+    brief = run(config, "clock.mode=realtime", slow, LONG)
+    cycles = brief.written.cycles["hub"]
+    # A cycle that began in time was over when the messages came.
+    assert (cycles["process_ns"] - cycles["read_ns"]).min() < brief.service_ns
+    written = sum(len(brief.written.messages[f"figure{at}.status"]) for at in range(BOARDS))
+    served, lost, _ = brief.counts
+    assert written - 3 * BOARDS <= served + lost <= written

@@ -44,6 +44,7 @@ def wiring(**changed: object) -> ClockWiring:
         "ends_run": None,
         "linger": 10,
         "silent": 40,
+        "longest": 0,
         "history": 100,
         "core": 0,
         "priority": 0,
@@ -246,6 +247,13 @@ def test_a_run_with_an_unfinished_task_ends_once_its_level_is_silent(make_bus: M
     found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), State.EXECUTING, 5, 60)
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
     assert found == [None] * 47 + [56] * 13
+
+
+def test_a_run_whose_task_never_ends_is_ended_by_its_longest_time(make_bus: MakeBus) -> None:
+    segment = make_bus(box(TaskStatus, "task.status"), task("task"))
+    found = ends_at(segment, State.EXECUTING, 5, 35, longest=20)
+    # Noticed at tick 20, which reads as of the tick before; ten ticks of rest.
+    assert found == [None] * 20 + [29] * 15
 
 
 def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:

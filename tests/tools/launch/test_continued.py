@@ -204,3 +204,22 @@ def test_a_run_of_an_older_version_needs_the_option_anyway(run: Path, tmp_path: 
     assert (
         json.loads(done.stdout)["digest"] == json.loads((run / "report.json").read_text())["digest"]
     )
+
+
+@pytest.mark.slow
+def test_a_fault_detected_before_a_branch_is_judged_as_in_the_whole_run(tmp_path: Path) -> None:
+    small, script = tmp_path / "small.toml", tmp_path / "mute.toml"
+    small.write_text(SMALL)
+    script.write_text('[[fault]]\nkind = "mute"\nboard = "upper"\nat = 0.4\nfor = "400ms"\n')
+    name = f"name=test-judged-{os.getpid()}"
+    whole, branch, second = (tmp_path / run for run in ("whole", "branch", "second"))
+    rack("run", small, "--lockstep", "--seconds", 1.2, "--faults", script, "--set", name,
+         "--out", whole)  # fmt: skip
+    for origin, out in ((f"{whole}@0.6", branch), (f"{branch}@0.7", second)):
+        rack("run", "--from", origin, "--seconds", 1.2, "--out", out)
+    reports = [json.loads((run / "report.json").read_text()) for run in (whole, branch, second)]
+    (fault,) = reports[0]["faults"]
+    assert (fault["seen"], fault["found_as"], fault["is_within"]) == ("detected", "mute", True)
+    assert fault["struck"] + fault["delay"] < 240
+    assert [report["faults"] for report in reports[1:]] == [[fault], [fault]]
+    assert not any(report["unexplained"] for report in reports)

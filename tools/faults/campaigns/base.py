@@ -14,14 +14,12 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX
-from rack.boards.events import Event
+from rack.boards.events import OF_LAUNCH, Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.faults.campaigns.plan import Plan
 
 EVERY_S = 2.0
 """Simulated time between two snapshots. On average a trial repeats half of it."""
-OF_LAUNCH = ("launch", "ready", "start")
-"""Kinds of events that each launch reports. A trial does not take them over from this run."""
 
 
 @dataclass(frozen=True)

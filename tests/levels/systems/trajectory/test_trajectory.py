@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
+from rack.backplane.words import Demand
+from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
@@ -56,6 +58,36 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     assert speed <= 1.0
     assert acceleration <= 1.0
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
+
+
+@pytest.mark.parametrize("waits", ["boards that hold", "an operator", "a required stop"])
+def test_a_request_fails_after_its_waits_unless_somebody_stops_the_arm(waits: str) -> None:
+    rig = TrajectoryRig(stalled=0.4)
+    waiting = rig.joints([0.3, 0, 0, 0, 0, 0], segment=5.0)
+    rig.joints([0] * 6)
+    rig.run(0.2)
+    if waits == "an operator":
+        rig.say(Operation.HOLD)
+    elif waits == "a required stop":
+        rig.level.demand = Demand.STOP
+    status = rig.written["status"]
+    # The boards hold again and again, each time for less than the limit.
+    for _ in range(8):
+        for board in rig.statuses.values():
+            board.stopped = waits != "an operator"
+        rig.run(0.1)
+        for board in rig.statuses.values():
+            board.stopped = False
+        status = rig.run(0.1)
+    if waits == "boards that hold":
+        assert status.reason == (
+            f"request {waiting}: waited for 0.4 s: waiting for joints0: it does not follow set"
+            " points"
+        )
+        assert status.error == Error.STALLED
+        assert rig.ends() == {waiting: RequestEnd.FAILED, waiting + 1: RequestEnd.CANCELLED}
+    else:
+        assert not status.error
 
 
 def test_after_an_error_new_requests_are_refused_until_a_cancel() -> None:
