@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.process import Reservation
-from rack.backplane.words import Demand
+from rack.backplane.words import Demand, Scheduler
 from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
@@ -86,6 +86,28 @@ class Continuation:
 
 
 @dataclass(frozen=True)
+class Scheduling:
+    """How the executor of a board competes for its core.
+
+    Attributes:
+        core: The core that the config requests.
+        scheduler: Its scheduler at the launch.
+        is_critical: Whether maximum urgency first runs it before others.
+        cost_ns: In lockstep, simulated processor time of a cycle. 0 if it takes none.
+        reservation: In real time, processor time to reserve under earliest deadline first. None
+            without a budget.
+        clocks: The same of the clock if it is on this core.
+    """
+
+    core: int
+    scheduler: Scheduler
+    is_critical: bool
+    cost_ns: int
+    reservation: Reservation | None
+    clocks: Reservation | None
+
+
+@dataclass(frozen=True)
 class TaskWiring:
     """Wiring of one task.
 
@@ -105,7 +127,7 @@ class TaskWiring:
         transfer: Minimum processor time of bus accesses.
         exchange: Rules for input ports that are read at a different rate or asynchronously. If
             there are any, the task writes its mailbox `<board>.exchange`.
-        reservation: Processor time to reserve instead of a priority, None for none.
+        scheduling: How the task competes for its core. None for a fixed priority that stays.
     """
 
     task: str
@@ -120,7 +142,7 @@ class TaskWiring:
     entries: RecordedEntries | None
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
-    reservation: Reservation | None
+    scheduling: Scheduling | None
 
 
 @dataclass(frozen=True)
@@ -167,6 +189,10 @@ class ClockWiring:
         restart_ticks: In lockstep, time from the loss of a board until it rejoins.
         on_loss: Stop required of the arm while a task is lost, keyed by task.
         reservation: Processor time to reserve instead of a priority, None for none.
+        loads: In lockstep, how executors compete for simulated cores, by task. Empty if computing
+            takes no simulated time.
+        simulated_core: Simulated core of the clock.
+        cost_ns: Simulated processor time of the clock in each tick.
     """
 
     lockstep: bool
@@ -182,3 +208,6 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
+    loads: Mapping[str, Scheduling]
+    simulated_core: int
+    cost_ns: int

@@ -23,7 +23,7 @@ from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
-from rack.boards.config.timing import compute_reservation, is_critical
+from rack.boards.config.timing import build_scheduling, compute_clock_reservation, is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -33,6 +33,7 @@ from rack.boards.wiring import (
     ClockWiring,
     HostWiring,
     RecordedEntries,
+    Scheduling,
     TaskWiring,
     list_mailboxes,
 )
@@ -162,10 +163,21 @@ class Resolved:
             core=core,
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
-            reservation=compute_reservation(config, config.timing.clock_ms, 1),
+            reservation=compute_clock_reservation(config),
+            loads=self._list_loads(),
+            simulated_core=clock.core,
+            cost_ns=round(config.timing.lockstep_load * config.timing.clock_ms * 1e6),
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
+
+    def _list_loads(self) -> Mapping[str, Scheduling]:
+        """Return how executors compete for simulated cores. Empty if computing takes no time."""
+        return {
+            task.task: task.scheduling
+            for task in self.tasks
+            if task.scheduling is not None and task.scheduling.cost_ns
+        }
 
     def _to_ticks(self, seconds: float) -> int:
         """Convert simulated time in s to ticks."""
@@ -309,9 +321,8 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            # Only executors reserve processor time.
-            reservation=compute_reservation(
-                self._config, board.busy_ms if is_executor else 0.0, spec.every
+            scheduling=(
+                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
             ),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}

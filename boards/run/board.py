@@ -29,6 +29,7 @@ from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
+from rack.boards.run.scheduling import take_scheduled_core
 from rack.boards.run.snapshots import TaskCopies, has_snapshots_enabled
 from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
@@ -140,10 +141,9 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             # Touch memory while the process still has ordinary priority, because a restarted board
             # must not delay another board's cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
+        take_scheduled_core(segment, wiring)
         disable_timer_slack()
         hold_memory(lockstep)
-        block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open_connections()
         task = (

@@ -17,6 +17,7 @@ from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE_PORT, ExchangeRecord
+from rack.boards.run.scheduling import SchedulerCommands
 from rack.boards.run.task import ClockGuard, Task, chain_accesses, slow_access
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -65,8 +66,11 @@ class VirtualControlLoop(Task):
             record = ExchangeRecord(self.inputs.mailboxes, message).fill_message
         reads = chain_accesses(self.inputs.read_command_and_status, record)
         settings = executor.take_settings if executor.is_set_by_board else None
+        schedule = None
+        if wiring.scheduling is not None:
+            schedule = SchedulerCommands(segment, wiring, self.alarms).take_commands
         self.read_command_and_status = chain_accesses(
-            self.serve, slow_access(reads, times.read_ns), settings
+            self.serve, slow_access(reads, times.read_ns), settings, schedule
         )
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
 
@@ -94,10 +98,13 @@ class VirtualControlLoop(Task):
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
 
-        If releases were skipped before the cycle, or if it is the first, also record this tick as
-        the beginning of regular reads.
+        Tell the level if it has missed a deadline. If releases were skipped before the cycle, or if
+        it is the first, also record this tick as the beginning of regular reads.
         """
-        if self.next_cycle.skipped or not self._has_cycled:
+        skipped = self.next_cycle.skipped
+        if self._has_cycled and (skipped or self.stopwatch.has_missed):
+            self.executor.handle_missed_deadline(tick, skipped)
+        if skipped or not self._has_cycled:
             self.inputs.task.since = tick
             self._has_cycled = True
         if self._guard is not None:

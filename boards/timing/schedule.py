@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from rack.boards.timing.scheduler import Urgency, simulate_core
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
@@ -115,7 +116,8 @@ def simulate_schedule(
         for task in tasks
     ]
     for core in {task.core for task in tasks}:
-        _simulate_core([runner for runner in runners if runner.task.core == core], until_ns)
+        for _ in simulate_core([r for r in runners if r.task.core == core], 0, until_ns):
+            pass
     spans = sorted(
         (s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core)
     )
@@ -124,19 +126,6 @@ def simulate_schedule(
         key=lambda job: (job.release_ns, job.task),
     )
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
-
-
-def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
-    """Simulate the tasks of one core. At each release and end of a part, choose the task to run."""
-    now = 0
-    while now < until_ns:
-        ready = [runner for runner in runners if runner.ready_at <= now]
-        next_release = min((r.ready_at for r in runners if r.ready_at > now), default=until_ns)
-        if not ready:
-            now = next_release
-            continue
-        first = min(ready, key=_TaskSimulation.get_sort_key)
-        now = first.run_step(now, min(next_release, until_ns))
 
 
 class _TaskSimulation:
@@ -164,7 +153,7 @@ class _TaskSimulation:
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
-    def get_sort_key(self) -> tuple[int, bool, int, str]:
+    def get_urgency(self, now_ns: int) -> Urgency:
         """Return the key by which ready tasks are sorted. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority

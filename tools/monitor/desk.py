@@ -273,7 +273,7 @@ def parse_goal(what: str, words: Sequence[str]) -> Document:
                 f"'modify {' '.join(words)}': must be 'modify NAME on' or 'modify NAME off'", 2
             )
         return {"name": words[0], "on": words[1] == "on"}
-    if what in ("table", "do", "set"):
+    if what in ("table", "do", "set", "schedule"):
         return {"name": " ".join(words)}
     goal: Document = {}
     for word in words:

@@ -45,7 +45,7 @@ RULES: tuple[Rule, ...] = (
     boards.check_clock,
     boards.check_rates,
     boards.check_polling,
-    boards.check_reservations,
+    boards.check_schedulers,
     boards.check_schedule,
     mailboxes.check_strict,
     mailboxes.check_ports,
@@ -70,7 +70,7 @@ NEEDS: Mapping[Rule, set[str]] = {
     boards.check_clock: {"clock"},
     boards.check_rates: {"clock"},
     boards.check_polling: {"clock"},
-    boards.check_reservations: {"clock"},
+    boards.check_schedulers: {"clock"},
     boards.check_schedule: {"clock"},
     levels.check_programs: {"robot", "scene", "task"},
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import Field
 
@@ -39,6 +39,9 @@ class TrajectoryParams(Table):
     """longest time for which the motion of a body is extrapolated [s]"""
     handover: int = Field(HANDOVER_CYCLES, ge=1, le=1000)
     """cycles after the first set point until statuses must show that it is followed"""
+    after_missed: Literal["continue", "hold"] = "continue"
+    """what follows a missed deadline of this level; hold: the arm comes to rest, until an operator
+    resumes the level or a program cancels its requests"""
 
 
 class MotionTools(NamedTuple):
