@@ -11,6 +11,10 @@ If an executor is the only task due in the next ticks, it gets their releases as
 ticks would each cost two context switches and the clock's work, together a fifth of a tick of
 `k1607`. During a batch no other task is released, no message of another task becomes visible, and
 the clock has nothing to do, so the executor reads and writes the same messages as without it.
+
+Computing takes no simulated time, unless a task states at which tick its cycle goes on. The task
+then waits in the middle of the cycle, and the clock does not wait for the task before that tick. In
+the meantime the clock releases the task as in real time, and finds that it misses these releases.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
-from rack.backplane.words import Run, System
+from rack.backplane.words import Block, Run, System
 
 MAX_RECORDER_WAIT_S = 30.0
 """Maximum time to wait for a recorder that is stopped or dead.
@@ -48,6 +52,7 @@ class LockstepDriver(ClockDriver):
         snapshot: Function called before every tick or batch, which takes a snapshot if one is
             due. It returns the next tick before which it must be called. Initially a function
             that does nothing.
+        permits_batches: False if cycles may take simulated time at any tick.
     """
 
     def __init__(
@@ -78,6 +83,7 @@ class LockstepDriver(ClockDriver):
         self._last_first = list(reversed(self.tasks))
         self.snapshot: Callable[[int], int] = lambda tick: sys.maxsize
         self._snapshot_at = 0
+        self.permits_batches = not one_at_a_time
         self._next = self.first_tick
         self._last = self._next - 1
 
@@ -127,12 +133,14 @@ class LockstepDriver(ClockDriver):
         begin at `tick`, the result is `tick` + 1.
         """
         controller = self.controller
-        if len(due) != 1 or controller is None or self._one_at_a_time:
+        if len(due) != 1 or controller is None or not self.permits_batches:
             return tick + 1
         (alone,) = due
         # An executor with a longer period needs no batch, because further ticks may begin while its
         # cycle is still running.
-        if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
+        if alone.spec.every > 1 or alone.spec.role != "executor":
+            return tick + 1
+        if alone.is_stopped or alone.is_waiting:
             return tick + 1
         words = self.words
         end = min(tick + MAX_BATCH_TICKS, self._snapshot_at, controller.find_next_work_tick(tick))
@@ -166,6 +174,8 @@ class LockstepDriver(ClockDriver):
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check_tasks(due, tick)
+        if not self.resume_cycles(tick):
+            return False
         order = self._last_first
         slowest = None
         for task in order:
@@ -182,6 +192,27 @@ class LockstepDriver(ClockDriver):
         if slowest is not None and slowest is not order[0]:
             order.remove(slowest)
             order.insert(0, slowest)
+        return True
+
+    def resume_cycles(self, tick: int) -> bool:
+        """Let each cycle that takes simulated time until `tick` go on, and wait for its end.
+
+        Its messages may be visible from the next tick, before the task's deadline.
+
+        Returns:
+            False if the launcher has ended or the host requests the end of the run.
+        """
+        for task in self.tasks:
+            if 0 < task.block[Block.FINISH] <= tick:
+                done = task.block[Block.DONE]
+                task.resume()
+                if not self.await_state(
+                    task,
+                    lambda task=task, done=done: (  # type: ignore[misc]
+                        task.block[Block.DONE] != done or task.is_settled()
+                    ),
+                ):
+                    return False
         return True
 
     def wait_until_settled(self) -> None:

@@ -93,15 +93,28 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def find_next_event(self, tick: int) -> int:
-        """Return the task's deadline if it is after `tick`, otherwise its next release tick."""
+        """Return the task's deadline if it is after `tick`, otherwise its next release tick.
+
+        If a cycle takes simulated time, return the tick at which it goes on.
+        """
+        if finish := self.block[Block.FINISH]:
+            return finish
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
 
     def is_settled(self) -> bool:
-        """Check whether the task has finished its last release, or is lost or stopped."""
+        """Check whether the task has finished its last release, or waits, is lost or is stopped.
+
+        A task waits during a cycle if the cycle takes simulated time.
+        """
         block = self.block
-        return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
+        return (
+            block[Block.DONE] == block[Block.RELEASED]
+            or self.is_waiting
+            or self.is_lost
+            or self.is_stopped
+        )
 
     def is_finished(self, tick: int) -> bool:
         """Return True if the task is settled or its deadline is after `tick`.
@@ -114,6 +127,16 @@ class ReleasedTask:
     def check_stopped(self) -> None:
         """Update `is_stopped` from the state of the task's process."""
         self.is_stopped = read_state(self.block[Block.PID]) in STOPPED_STATES
+
+    @property
+    def is_waiting(self) -> bool:
+        """True if a cycle takes simulated time and its task waits for a later tick, in lockstep."""
+        return self.block[Block.FINISH] != 0
+
+    def resume(self) -> None:
+        """Let a task that waits go on with its cycle."""
+        self.block[Block.FINISH] = 0
+        self.wake()
 
     @property
     def is_lost(self) -> bool:
@@ -147,7 +170,7 @@ class ReleasedTask:
         """Mark the task as no longer lost, so that its new process gets the task's next release."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
-        block[Block.DEADLINE] = 0
+        block[Block.DEADLINE] = block[Block.FINISH] = 0
         self.missed = 0
         self.is_stopped = False
         block[Block.LOST] = 0
@@ -197,12 +220,18 @@ class Watchdog:
             )
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
-        """Check whether a task hangs: it is stopped, or has waited or computed for too long."""
+        """Check whether a task hangs: it is stopped, or has waited or computed for too long.
+
+        A task whose cycle takes simulated time does not hang, because the end of its cycle is
+        known.
+        """
         spec = task.spec
         pid = task.block[Block.PID]
         state = read_state(pid)
         if state in STOPPED_STATES:
             return True
+        if task.is_waiting:
+            return False
         bound_ns = max(MIN_HANG_NS, RELEASES_MISSED * spec.slice * self._period_ns)
         if task.missed * spec.every * self._period_ns <= bound_ns:
             return False

@@ -27,7 +27,7 @@ from time import monotonic_ns, sleep
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.process import ENDED_STATES, STOPPED_STATES, WAITING_STATES, read_state
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import get_wake_semaphore
+from rack.backplane.semaphores import get_done_semaphore, get_wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
@@ -69,6 +69,7 @@ class NextCycle:
         self._block = segment.get_block(task)
         self._semaphore = get_wake_semaphore(segment, task)
         self._segment = segment
+        self._notify_clock: Callable[[], object] = get_done_semaphore(segment, task).release
         is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._sleeps = spec.wake == "timer" and not is_lockstep
         self._is_posted = not self._sleeps and spec.wake != "poll"
@@ -223,6 +224,27 @@ class NextCycle:
     def _has_begun(self) -> bool:
         """True if the task's first release is past. Before it, the clock may not have started."""
         return self._due > self._spec.phase
+
+    def return_release(self, tick: int) -> None:
+        """Return the release at `tick`, which `wait` has given: the next call counts it as skipped.
+
+        That call gives it again if there is no newer one.
+        """
+        self._due = tick - self.skipped * self._spec.every
+
+    def wait_for_tick(self, tick: int) -> None:
+        """In lockstep, wait in the middle of a cycle until the clock has begun `tick`.
+
+        The clock first gives the releases of that tick. The wait also ends with the run.
+        """
+        block = self._block
+        block[Block.FINISH] = tick
+        self._notify_clock()
+        while block[Block.FINISH] and self._words[System.STATE] != _STOPPED:
+            if block[Block.COPY] > 0 and self.copy is not None:
+                self.copy()
+            if not self._await_post():
+                return
 
     def skip_until(self, tick: int) -> None:
         """Ignore releases before `tick`. A planner calls this to reserve its plan's time slice."""

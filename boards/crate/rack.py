@@ -202,7 +202,7 @@ class Rack:
         before = self._continues or Continuation(0)
         for injection in plan.faults[before.faults :]:
             entry = table.add_fault(injection)
-            if KINDS[injection.kind].where == "core":
+            if KINDS[injection.kind].where == "core" and not self.config.is_lockstep:
                 crate.send_request(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
         # A snapshot contains pending commands, and also leases of clients that no longer exist.

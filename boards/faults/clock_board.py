@@ -52,12 +52,15 @@ class ClockStep:
         during: Called in each tick while it is active.
         end: Called when it ends.
         is_void: Returns True if the affected process is gone, so that the fault ends early.
+        lateness: Returns by how many ticks a tick begins late, from the fault and the tick. None if
+            ticks are not late.
     """
 
     begin: Strike = _do_nothing
     during: Strike = _do_nothing
     end: Strike = _do_nothing
     is_void: Callable[[FaultStage, FaultEntry], bool] = lambda rack, entry: False
+    lateness: Callable[[FaultEntry, int], float] | None = None
 
 
 def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
@@ -125,13 +128,17 @@ def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     stage.driver.count_skipped(tick, stage.driver.skip)
 
 
-def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Delay a tick by a random part of its period.
+def _draw_lateness(entry: FaultEntry, tick: int) -> float:
+    """Return the lateness of a tick, between `MIN_LATENESS_TICKS` and the fault's parameter."""
+    return random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
 
-    It is between `MIN_LATENESS_TICKS` and the fault's parameter.
-    """
+
+def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Delay a tick by a random part of its period. In lockstep, each task computes its lateness."""
     entry.record_action(tick)
-    delay = random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
+    if stage.clock.is_lockstep:
+        return
+    delay = _draw_lateness(entry, tick)
     until_ns = stage.clock.compute_time_ns(tick) + int(delay * stage.clock.period_ns)
     # The delay is less than a tick period, so the clock's grid is not shifted.
     time.sleep(max(0, until_ns - time.monotonic_ns()) * 1e-9)
@@ -142,7 +149,7 @@ HANG = ClockStep(_stop_process, end=_continue_process, is_void=_is_process_lost)
 MASQUERADE = ClockStep(_forge_message)
 CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip_ticks)
-CLOCK_JITTER = ClockStep(during=_delay_tick)
+CLOCK_JITTER = ClockStep(during=_delay_tick, lateness=_draw_lateness)
 ELSEWHERE = ClockStep()
 """Steps of a fault that acts in another process: the clock's board does nothing."""
 
@@ -161,8 +168,11 @@ def _find_next_change(entry: FaultEntry, tick: int) -> int:
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
-        may_end_early = find_kind(entry).once or _find_step(entry) is not ELSEWHERE
-        return tick + 1 if may_end_early else entry.until
+        kind = find_kind(entry)
+        may_end_early = kind.once or _find_step(entry) is not ELSEWHERE
+        # A fault that takes computing time needs each tick alone, because releases may be missed.
+        takes_time = kind.where in ("load", "core")
+        return tick + 1 if may_end_early or takes_time else entry.until
     return NEVER
 
 

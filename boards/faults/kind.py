@@ -36,7 +36,7 @@ Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "ar
 
 - `process`, `clock`, `bus`: in the clock's board, at the start of a tick.
 - `load`, `writer`, `lock`: in the task itself.
-- `core`: in a separate process on the task's core.
+- `core`: in a separate process on the task's core. In lockstep, in each task of that core.
 - `arm`: in the level that drives the arm.
 - `start`: in the board as it starts.
 """

@@ -139,7 +139,6 @@ KINDS.add(
         # The cycle is still running at its next release.
         bound=bounds.cycle_bound(1),
         lasts=draw.uniform_cycles(1, 4),
-        realtime=True,
     ),
     Kind(
         name="planner-slow",
@@ -161,7 +160,6 @@ KINDS.add(
         detected_as=(Alarm.PLAN_LATE,),
         bound=bounds.SLICE + bounds.RELEASE,
         lasts=draw.longest_of(draw.uniform_cycles(3, 6), draw.uniform_seconds(1.0, 2.0)),
-        realtime=True,
     ),
     Kind(
         name="hog",
@@ -171,7 +169,6 @@ KINDS.add(
         detected_as=(Alarm.STARVED,),
         bound=bounds.cycle_bound(4 + 1),
         lasts=draw.longest_of(draw.uniform_cycles(7, 9), draw.uniform_seconds(0.1, 0.3)),
-        realtime=True,
     ),
     _message(
         name="mute",
@@ -360,7 +357,6 @@ KINDS.add(
         detected_as=(Alarm.CLOCK_LATE,),
         bound=bounds.tick_bound(2),
         lasts=draw.uniform_seconds(0.2, 0.6),
-        realtime=True,
     ),
     _sensor(
         name="sensor-nan",

@@ -16,6 +16,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.process import pin_to_core
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
+from rack.boards.faults.clock_board import ClockStep
 from rack.boards.faults.kind import find_kind
 from rack.levels.fault_steps import Fault
 
@@ -29,19 +30,30 @@ MAX_POLL_S = 0.05
 
 
 @dataclass(frozen=True)
+class SimulatedClock:
+    """Simulated time since tick 0, with the methods of `SystemClock` that load steps use."""
+
+    period_ns: int
+
+    def compute_time_ns(self, tick: int) -> int:
+        """Return the time of a tick in ns."""
+        return tick * self.period_ns
+
+
+@dataclass(frozen=True)
 class ExtraComputing:
     """Extra computing time in a task's cycle.
 
     Attributes:
         entry: The fault.
         spec: The affected task.
-        clock: System clock of the rack.
+        clock: Clock on which the computing takes time.
         until: Step of the kind, which computes when the extra computing ends.
     """
 
     entry: FaultEntry
     spec: TaskSpec
-    clock: SystemClock
+    clock: SystemClock | SimulatedClock
     until: LoadStep
 
     def burn_time(self, tick: int) -> None:
@@ -60,7 +72,7 @@ class ExtraComputing:
 LoadStep = Callable[[ExtraComputing, int, int], int]
 """Computes the time at which extra computing ends from the load, the tick and the current time.
 
-Times are CLOCK_MONOTONIC in ns.
+Times are CLOCK_MONOTONIC in ns, in lockstep simulated ns since tick 0.
 """
 
 
@@ -70,10 +82,10 @@ def compute_cycle_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
         tick: Release of the cycle.
-        now_ns: Current CLOCK_MONOTONIC in ns.
+        now_ns: Current time in ns.
 
     Returns:
-        CLOCK_MONOTONIC in ns at which the computing ends.
+        Time in ns at which the computing ends.
     """
     by, is_random, *_ = load.entry.parameters
     fraction = random.Random(load.entry.seed + tick).random() if is_random else 1.0
@@ -86,10 +98,10 @@ def compute_slice_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameter `by`.
         tick: Release of the slice.
-        now_ns: Current CLOCK_MONOTONIC in ns.
+        now_ns: Current time in ns.
 
     Returns:
-        CLOCK_MONOTONIC in ns at which the computing ends.
+        Time in ns at which the computing ends.
     """
     slice_end = load.clock.compute_time_ns(tick + load.spec.slice)
     return max(now_ns, slice_end) + load.cycles_ns(load.entry.parameters[0])
@@ -106,6 +118,7 @@ class TaskFaults:
 
     Attributes:
         loads: Extra computing of the active faults.
+        taken_until: In lockstep, tick until which faults take the core from this task.
     """
 
     def __init__(
@@ -117,12 +130,16 @@ class TaskFaults:
     ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
+        self._tasks = segment.layout.tasks
         self._index = segment.layout.processes.index(spec)
         self._apply = apply
         self._level = level
-        self._clock = SystemClock(segment)
+        clock = SystemClock(segment)
+        self._clock = SimulatedClock(segment.layout.clock_ns) if clock.is_lockstep else clock
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
+        self.taken_until = 0
+        self._late_ticks: list[FaultEntry] = []
 
     def refresh_faults(self, tick: int) -> int:
         """Apply the faults that are active at `tick`.
@@ -130,10 +147,13 @@ class TaskFaults:
         Returns:
             Generation of the fault table, so that the caller can skip this call while it is
             unchanged. -1 if a fault is marked as active but begins at a later tick, which happens
-            because the clock works ahead of the grid. The next cycle must then call this again.
+            because the clock works ahead of the grid. The next cycle must then call this again. In
+            lockstep also -1 while ticks are late, because each has another lateness.
         """
         generation = self._table.generation
         entries = self._table.list_entries((Stage.ACTIVE,))
+        if isinstance(self._clock, SimulatedClock):
+            self._refresh_simulated_faults(entries, tick)
         begun = [(find_kind(entry), entry) for entry in entries if entry.task == self._index]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [
@@ -150,12 +170,53 @@ class TaskFaults:
                 for kind, entry in arm_faults
             ]
             cast("Executor", self._level).inject(faults)
-        return generation if len(active) == len(begun) else -1
+        return generation if len(active) == len(begun) and not self._late_ticks else -1
+
+    def _refresh_simulated_faults(self, entries: Sequence[FaultEntry], tick: int) -> None:
+        """Find the active faults of the core and the clock, which act in each task in lockstep."""
+        spec = self._spec
+        self.taken_until = 0
+        self._late_ticks = []
+        for entry in entries:
+            kind = find_kind(entry)
+            if kind.where == "core" and entry.task >= 0:
+                struck = self._tasks[entry.task]
+                if struck.core == spec.core and struck.priority >= spec.priority:
+                    self.taken_until = max(self.taken_until, entry.until)
+                    if struck is spec:
+                        entry.record_action(tick)
+            elif isinstance(kind.step, ClockStep) and kind.step.lateness is not None:
+                self._late_ticks.append(entry)
+
+    def find_lateness(self, tick: int) -> float:
+        """In lockstep, return by how many ticks the clock begins `tick` late."""
+        late = [
+            step.lateness(entry, tick)
+            for entry in self._late_ticks
+            if isinstance(step := find_kind(entry).step, ClockStep) and step.lateness is not None
+        ]
+        return max(late, default=0.0)
 
     def burn_time(self, tick: int) -> None:
-        """Keep the processor busy for each active fault in turn."""
+        """In real time, keep the processor busy for each active fault in turn."""
+        if isinstance(self._clock, SystemClock):
+            for load in self.loads:
+                load.burn_time(tick)
+
+    def extend_computing(self, tick: int, begin_ns: int, end_ns: int) -> int:
+        """In lockstep, return the end of the computing with the active faults.
+
+        This is a `rack.boards.run.simulated_time.FinishStep`.
+
+        Args:
+            tick: Release tick of the cycle.
+            begin_ns: Begin of the cycle.
+            end_ns: End of the cycle without the faults.
+        """
         for load in self.loads:
-            load.burn_time(tick)
+            load.entry.record_action(tick)
+            end_ns = load.until(load, tick, end_ns)
+        return end_ns
 
     def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:
         """Record which faults of the arm acted in the cycle released at `tick`.

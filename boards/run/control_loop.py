@@ -18,6 +18,7 @@ from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE_PORT, ExchangeRecord
 from rack.boards.run.scheduling import SchedulerCommands
+from rack.boards.run.simulated_cores import CoreStep
 from rack.boards.run.task import ClockGuard, Task, chain_accesses, slow_access
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -69,6 +70,8 @@ class VirtualControlLoop(Task):
         schedule = None
         if wiring.scheduling is not None:
             schedule = SchedulerCommands(segment, wiring, self.alarms).take_commands
+            if wiring.scheduling.cost_ns:
+                self.simulated.steps.append(CoreStep(self, wiring.scheduling.cost_ns))
         self.read_command_and_status = chain_accesses(
             self.serve, slow_access(reads, times.read_ns), settings, schedule
         )
@@ -90,10 +93,17 @@ class VirtualControlLoop(Task):
         self.read_command_and_status(tick)
         watch.read_ns = monotonic_ns()
         self.process(tick)
+        ended = self.end_computing(tick, deadline) if self.simulated.steps else None
         watch.process_ns = monotonic_ns()
-        in_time = self.write_command_and_status(tick, watch.find_late_tick(deadline))
+        in_time = self.write_command_and_status(tick, ended or watch.find_late_tick(deadline))
         watch.end_ns = monotonic_ns()
+        in_time = in_time and (ended is None or ended < deadline)
         watch.finish_cycle(in_time, deadline, done=tick)
+
+    def set_lateness(self, ticks: float) -> None:
+        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
+        super().set_lateness(ticks)
+        self.executor.late_s = ticks * self.simulated.clock_ns * 1e-9
 
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
@@ -108,7 +118,7 @@ class VirtualControlLoop(Task):
             self.inputs.task.since = tick
             self._has_cycled = True
         if self._guard is not None:
-            self._guard.check_release(tick)
+            self._guard.check_release(tick, self.stopwatch.late_ns)
 
     def process(self, tick: int) -> None:
         """Run the level's `process`, then handle its findings and the faults that are active."""
@@ -185,11 +195,13 @@ class PlannerLoop(Task):
             self._pass_release(tick)
             return
         # Reserve the time slice of a plan. Until its end the clock does not release this task.
-        self.next_cycle.skip_until(tick + self.slice)
-        self.block[Block.DEADLINE] = tick + self.slice
+        deadline = tick + self.slice
+        self.next_cycle.skip_until(deadline)
+        self.block[Block.DEADLINE] = deadline
         self.stopwatch.notify_clock()
         self.planner.plan(tick)
         self.faults.burn_time(tick)
+        ended = self.end_computing(tick, deadline) if self.simulated.steps else None
         if self._critical_priority:
             # At this priority the executor cannot preempt the update of the plan.
             set_priority(self._critical_priority)
@@ -197,7 +209,7 @@ class PlannerLoop(Task):
             # Take the time stamps at this priority. Otherwise the executor could run between a
             # stamp and the write.
             watch.process_ns = monotonic_ns()
-            in_time = self.write_plan(tick, watch.find_late_tick(tick + self.slice))
+            in_time = self.write_plan(tick, ended or watch.find_late_tick(deadline))
             watch.end_ns = monotonic_ns()
         finally:
             if self._critical_priority:
@@ -205,8 +217,9 @@ class PlannerLoop(Task):
         self.block[Block.PLANS] += 1
         # A plan that began late may still use its whole slice. All releases within the slice count
         # as done.
-        done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
-        watch.finish_cycle(in_time, tick + self.slice, done, Flag.PLANNED)
+        done = max(tick, min(self.block[Block.RELEASED], deadline - self.spec.every))
+        in_time = in_time and (ended is None or ended < deadline)
+        watch.finish_cycle(in_time, deadline, done, Flag.PLANNED)
 
     def _pass_release(self, tick: int) -> None:
         """Finish a cycle in which no plan is wanted, and publish messages that faults have delayed.

@@ -7,13 +7,17 @@ the core, and changes of a scheduler, thus act on jobs that have begun.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.words import Block, Run, Scheduler, System
-from rack.boards.run.task import Task
 from rack.boards.timing.scheduler import CoreJob, SimulatedCore
 from rack.boards.wiring import ClockWiring, Scheduling
+
+if TYPE_CHECKING:
+    from rack.boards.run.task import Task
 
 UNKNOWN = 1 << 62
 """Value of `Block.FINISH` until the end of a job is known."""
@@ -62,8 +66,8 @@ class SimulatedCores:
 
     def run_tick(self, tick: int) -> None:
         """Let the cycles go on whose jobs end in `tick`. Call this after the releases of `tick`."""
-        for task in self._tasks.values():
-            self._resume_due_cycle(task, tick)
+        # A cycle that has missed its deadline may go on at this tick.
+        self._driver.resume_cycles(tick)
         for number, core in self._cores.items():
             begin_ns = tick * self._clock_ns
             core.jobs = [
@@ -79,14 +83,11 @@ class SimulatedCores:
                 if job.task != CLOCK:
                     task = self._tasks[job.task]
                     task.block[Block.COMPUTING_NS] = core.now_ns
-                    self._driver.resume_cycle(task)
-                    self._resume_due_cycle(task, tick)
+                    task.block[Block.FINISH] = tick
+                    self._driver.resume_cycles(tick)
+                    # If the job has missed its deadline, the cycle waits once more.
+                    self._driver.resume_cycles(tick)
                     self._add_job(core, task, self._wiring.loads[job.task], core.now_ns)
-
-    def _resume_due_cycle(self, task: ReleasedTask, tick: int) -> None:
-        """Let a cycle go on that waits for this tick because it has missed its deadline."""
-        if 0 < task.block[Block.FINISH] <= tick:
-            self._driver.resume_cycle(task)
 
     def _add_job(
         self, core: SimulatedCore, task: ReleasedTask, load: Scheduling, ready_at: int
@@ -102,9 +103,7 @@ class SimulatedCores:
         block = task.block
         if block[Block.RELEASED] <= block[Block.DONE]:
             return
-        self._driver.await_state(
-            task, lambda: block[Block.FINISH] == UNKNOWN or task.is_lost or task.is_stopped
-        )
+        self._driver.await_state(task, lambda: task.is_waiting or task.is_lost or task.is_stopped)
         if block[Block.FINISH] != UNKNOWN:
             return
         release = block[Block.RELEASED]

@@ -34,6 +34,7 @@ class Stopwatch:
         is_late: True if the cycle began more than half a tick late or after skipped releases, if
             the cycle before it missed its deadline, or if it is the first.
         has_missed: True if the last cycle has missed its deadline.
+        late_ns: In lockstep, simulated lateness of the clock for the cycle.
         start_ns: Start of the cycle. All times are on CLOCK_MONOTONIC.
         plan_ns: End of the plan's transfer over the bus (C of fig. 4).
         read_ns: End of the reading of command, status and plan (R).
@@ -69,9 +70,10 @@ class Stopwatch:
         self._period_ns = self._clock.period_ns
         self._tick = self._skipped = 0
         self._late_ns = self._period_ns // 2
-        self._release_ns = 0  # grid point of the tick, in lockstep the start of the cycle
+        self._release_ns = 0  # grid point of the tick, in lockstep the start without `late_ns`
         self.is_late = True
         self.has_missed = False
+        self.late_ns = 0
         self.start_ns = self.plan_ns = self.read_ns = self.process_ns = self.end_ns = 0
 
     def start_counting(self) -> None:
@@ -85,6 +87,8 @@ class Stopwatch:
         self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
         if self._lockstep_done is None:
             release_ns = self._words[System.EPOCH_NS] + tick * self._period_ns
+        else:
+            release_ns -= self.late_ns
         self._release_ns = release_ns
         self.is_late = (
             skipped > 0
@@ -152,8 +156,8 @@ class Stopwatch:
         )
         self._cycles = block[Block.CYCLES] = self._cycles + 1
         block[Block.DONE] = done
-        if lockstep_done is not None and done >= block[Block.RELEASED]:
-            # This was the last release of a batch.
+        if lockstep_done is not None and (is_missed or done >= block[Block.RELEASED]):
+            # This was the last release of a batch, or the clock waits for a late cycle.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
             self.update_bus_counters()

@@ -30,6 +30,7 @@ from rack.backplane.words import Block, Demand, Run, System, is_switched_on
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operator import build_hold_command
 from rack.boards.run.copying import Copier
+from rack.boards.run.simulated_cores import SimulatedCores
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import ClockWiring
 from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
@@ -47,6 +48,9 @@ class SystemController:
     """Work of the clock's board at every tick, apart from releasing tasks.
 
     Implements `rack.backplane.clock.driver.Controller`.
+
+    Attributes:
+        cores: Simulated cores, in lockstep if computing takes simulated time.
     """
 
     def __init__(
@@ -60,6 +64,7 @@ class SystemController:
         self._desk = OperatorCommandIssuer(segment, driver.alarms)
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
+        self.cores: SimulatedCores | None = None
 
     def begin_tick(self, tick: int) -> None:
         """Do the work that is due before the tasks of `tick` are released."""
@@ -81,6 +86,8 @@ class SystemController:
     def finish_release(self, tick: int) -> None:
         """Do the work that is due after the tasks of `tick` have been released."""
         self._faults.act_within_tick(tick)
+        if self.cores is not None:
+            self.cores.run_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:
         """Return the first tick after `tick` at which `begin_tick` has work or the run may end."""
@@ -355,5 +362,8 @@ def run_clock(
             driver.snapshot = ClockCopies(segment, driver, copier)
     else:
         driver = RealtimeDriver(segment, end_of_run, alarms)
-    driver.controller = SystemController(segment, wiring, driver, end_of_run)
+    driver.controller = controller = SystemController(segment, wiring, driver, end_of_run)
+    if isinstance(driver, LockstepDriver) and wiring.loads:
+        driver.permits_batches = False
+        controller.cores = SimulatedCores(wiring, driver, segment.layout.clock_ns)
     driver.run()

@@ -16,6 +16,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.faults.tasks import TaskFaults
 from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.boards.run.simulated_time import SimulatedTime
 from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
@@ -32,6 +33,7 @@ class Task(ABC):
     Attributes:
         spec: Description of the task from the layout.
         block: Control block of the task.
+        simulated: Simulated times of the cycles, in lockstep.
         serve: Function that serves the board's interrupts in each cycle. None if nothing
             interrupts the board, or another of its tasks serves the interrupts.
     """
@@ -71,6 +73,7 @@ class Task(ABC):
         )
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs.apply_faults, level)
+        self.simulated = SimulatedTime(segment, spec)
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
@@ -78,12 +81,40 @@ class Task(ABC):
 
         Faults of the task begin and end during this call, between two cycles.
         """
-        tick = self.next_cycle.wait()
-        if tick is None:
-            return None
-        if self.words[System.FAULTS] != self._generation:
-            self._generation = self.faults.refresh_faults(tick)
-        return tick
+        while (tick := self.next_cycle.wait()) is not None:
+            if self.words[System.FAULTS] == self._generation:
+                return tick
+            faults = self.faults
+            self._generation = faults.refresh_faults(tick)
+            if faults.taken_until <= tick:
+                if self.clock.is_lockstep:
+                    self.simulated.insert_step(faults.extend_computing, bool(faults.loads))
+                    self.set_lateness(faults.find_lateness(tick))
+                return tick
+            # The core is taken: the task gets its newest release once the core is free again.
+            self.next_cycle.return_release(tick)
+            self.next_cycle.wait_for_tick(faults.taken_until)
+        return None
+
+    def set_lateness(self, ticks: float) -> None:
+        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
+        self.simulated.late_ns = int(ticks * self.simulated.clock_ns)
+        self.stopwatch.late_ns = int(ticks * self.clock.period_ns)
+
+    def end_computing(self, tick: int, deadline: int) -> int | None:
+        """In lockstep, wait until the clock has begun the tick in which the computing ends.
+
+        Args:
+            tick: Release tick of the cycle.
+            deadline: Tick before which the cycle must end.
+
+        Returns:
+            That tick. None if the messages of the cycle are the same without a wait.
+        """
+        end_tick = self.simulated.find_end_tick(tick, deadline)
+        if end_tick is not None:
+            self.next_cycle.wait_for_tick(end_tick)
+        return end_tick
 
     def run(self) -> None:
         """Cycle until the run is over."""
@@ -135,18 +166,20 @@ class ClockGuard:
             )
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
-    def check_release(self, tick: int) -> None:
+    def check_release(self, tick: int, late_ns: int = 0) -> None:
         """Raise an alarm, once per episode, if the cycle began late because the clock was late.
 
         Args:
             tick: Release tick of the cycle.
+            late_ns: In lockstep, lateness of the clock.
         """
         words = self._words
-        late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
-        # Check this after reading the time, which belongs to this tick only if the clock has not
-        # advanced since.
-        if self._clock.is_lockstep or words[System.TICK] != tick:
-            return
+        if not self._clock.is_lockstep:
+            late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
+            # Check this after reading the time, which belongs to this tick only if the clock has
+            # not advanced since.
+            if words[System.TICK] != tick:
+                return
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:
                 self._alarms.raise_alarm(tick, Alarm.CLOCK_LATE, value=late_ns)

@@ -121,6 +121,7 @@ class DrivableArm(ABC):
 
     dynamics: Dynamics  # for the level that drives the arm
     tick: int  # present tick
+    late_s: float  # s: in lockstep, time by which the clock is late for the present cycle
     state: DriveState  # of the drives, after the last `step`
     torque: Array  # (joints,), N m: last torque of the motors
     grip_force: float  # N: last force of the gripper

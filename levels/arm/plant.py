@@ -35,6 +35,7 @@ class Plant:
         self._found_ticks: dict[Alarm, int] = {}  # tick of the last finding of each kind
         self._reported_tick = -1  # tick of the last cycle that was reported
         self.tick = 0  # present tick
+        self.late_s = 0.0  # s: time by which the clock is late for the present cycle
         self.waited = 0  # ticks since the last command
         # True while it is held without commands: by the brakes of an arm, or the valves of a hand.
         self.braked = True

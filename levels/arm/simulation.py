@@ -37,9 +37,11 @@ CHECKED_QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N 
 class Simulation(Plant):
     """A plant simulated with MuJoCo, in `substeps` steps per tick.
 
-    Simulated time is always the tick number times the duration of a tick. Subclasses call
-    `prepare_simulation` in their constructor, and set the controls of the drives before each
-    `_simulate_tick`.
+    Simulated time is the tick number times the duration of a tick, plus `late_s`. A tick before a
+    late cycle is simulated in the same number of steps, which are longer. The simulated time is
+    therefore exact, whereas a fraction of a tick has few whole steps, and each step is checked as
+    in other ticks. Subclasses call `prepare_simulation` in their constructor, and set the controls
+    of the drives before each `_simulate_tick`.
     """
 
     sleeps: ClassVar[bool] = True
@@ -51,6 +53,7 @@ class Simulation(Plant):
         if self.sleeps:
             self._model = enable_sleep(cell.model, scene)
         self._clock_ns = clock_ns
+        self._shift_s = 0.0  # simulated time minus the time of the tick
         steps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
         self._steps = prepare_substeps(cell, self._model, self._data, steps)
         # True positions and velocities, (joints,) each.
@@ -107,12 +110,12 @@ class Simulation(Plant):
     @property
     def _now_s(self) -> float:
         """Simulated time at the beginning of the tick, in s."""
-        return self.tick * self._clock_ns * 1e-9
+        return self.tick * self._clock_ns * 1e-9 + self._shift_s
 
     @property
     def _tick_end_s(self) -> float:
         """Simulated time at the end of the tick, in s."""
-        return (self.tick + 1) * self._clock_ns * 1e-9
+        return (self.tick + 1) * self._clock_ns * 1e-9 + self._shift_s
 
     def _simulate_tick(self) -> None:
         """Simulate one tick: move obstacles, apply pushes, and make the steps."""
@@ -120,6 +123,22 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = compute_push_force(pushes, self._now_s)
+        if self.late_s != self._shift_s:
+            self._simulate_shift()
+            return
+        self._make_steps()
+
+    def _simulate_shift(self) -> None:
+        """Simulate a tick that is longer or shorter, because the lateness of the clock changes."""
+        option = self._model.opt
+        step_s = option.timestep
+        option.timestep += (self.late_s - self._shift_s) / len(self._steps.seen)
+        self._shift_s = self.late_s
+        self._make_steps()
+        option.timestep = step_s
+
+    def _make_steps(self) -> None:
+        """Make the steps of a tick."""
         steps_made = self._advance(0, self._tick_end_s, *self._steps)
         if steps_made < 0:
             self._finish_failed_tick(-steps_made)

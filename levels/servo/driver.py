@@ -269,6 +269,7 @@ class ArmDriver(Executor):
         if is_first and self.takeover.start(self.before):
             self.on_restored()
         ticks = tick - self.arm.tick
+        self.arm.late_s = self.late_s
         self.arm.step(ticks)
         self.arm.report_braking()
         if is_first or ticks == self.context.every:

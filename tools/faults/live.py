@@ -69,7 +69,7 @@ class LiveRack:
         checked = build_live_injection(fault, self._config, self._levels, self._segment.layout)
         self._check_fault(fault)
         entry = self._table.add_fault(checked)
-        if KINDS[fault.kind].where == "core":
+        if KINDS[fault.kind].where == "core" and not self._config.is_lockstep:
             # For such a fault, this process itself occupies the core.
             self._print_waiting(entry)
             run_core_fault(self._segment, entry.index)
@@ -170,6 +170,8 @@ class LiveRack:
         if fault.lasts is None and fault.cycles is None:
             why = f"missing; a {fault.kind} must have an end: --for or --cycles"
             raise ConfigError([Mistake("for", None, why)])
+        if self._config.is_lockstep:
+            return
         if not set_priority(1):
             why = "SCHED_FIFO is refused to this user; no core can be taken from a board"
             raise Failure(f"{fault.kind}: {why}")

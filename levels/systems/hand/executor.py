@@ -131,6 +131,7 @@ class HandExecutor(Executor):
                 self.hand.restore(self.before.message)
                 self._opened = True
             self._closed_at = tick
+        hand.late_s = self.late_s
         self.hand.step(tick - self.hand.tick)
         # The hand closes its valves by itself if no tensions arrive in time.
         if self.hand.braked and self._closed_at is None:
