@@ -83,8 +83,7 @@ class SimulatedCores:
                 if job.task != CLOCK:
                     task = self._tasks[job.task]
                     task.block[Block.COMPUTING_NS] = core.now_ns
-                    task.block[Block.FINISH] = tick
-                    self._driver.resume_cycles(tick)
+                    self._driver.resume_cycle(task)
                     # If the job has missed its deadline, the cycle waits once more.
                     self._driver.resume_cycles(tick)
                     self._add_job(core, task, self._wiring.loads[job.task], core.now_ns)
