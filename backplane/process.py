@@ -249,16 +249,20 @@ def describe_refusal(error: OSError) -> str:
     return f"{error.strerror}: the limit is {maximum} {resource} (ulimit -{option})"
 
 
-def set_priority(priority: int) -> bool:
-    """Set the SCHED_FIFO priority of the calling process. 0 selects ordinary scheduling.
+def set_priority(priority: int, pid: int = 0) -> bool:
+    """Set the SCHED_FIFO priority of a process. 0 selects ordinary scheduling.
+
+    Args:
+        priority: The priority.
+        pid: The process, 0 for the calling one.
 
     Returns:
         False if the system refuses.
     """
     policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
     try:
-        os.sched_setscheduler(0, policy, os.sched_param(priority))
-    except PermissionError:
+        os.sched_setscheduler(pid, policy, os.sched_param(priority))
+    except (PermissionError, ProcessLookupError):
         return False
     return True
 

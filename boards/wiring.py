@@ -189,8 +189,8 @@ class ClockWiring:
         restart_ticks: In lockstep, time from the loss of a board until it rejoins.
         on_loss: Stop required of the arm while a task is lost, keyed by task.
         reservation: Processor time to reserve instead of a priority, None for none.
-        loads: In lockstep, how executors compete for simulated cores, by task. Empty if computing
-            takes no simulated time.
+        schedulings: How executors compete for their cores, by task. Empty if the config names no
+            scheduler.
         simulated_core: Simulated core of the clock.
         cost_ns: Simulated processor time of the clock in each tick.
     """
@@ -208,6 +208,6 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
-    loads: Mapping[str, Scheduling]
+    schedulings: Mapping[str, Scheduling]
     simulated_core: int
     cost_ns: int

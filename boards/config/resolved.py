@@ -33,7 +33,6 @@ from rack.boards.wiring import (
     ClockWiring,
     HostWiring,
     RecordedEntries,
-    Scheduling,
     TaskWiring,
     list_mailboxes,
 )
@@ -164,20 +163,12 @@ class Resolved:
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
-            loads=self._list_loads(),
+            schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
             simulated_core=clock.core,
             cost_ns=round(config.timing.lockstep_load * config.timing.clock_ms * 1e6),
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
-
-    def _list_loads(self) -> Mapping[str, Scheduling]:
-        """Return how executors compete for simulated cores. Empty if computing takes no time."""
-        return {
-            task.task: task.scheduling
-            for task in self.tasks
-            if task.scheduling is not None and task.scheduling.cost_ns
-        }
 
     def _to_ticks(self, seconds: float) -> int:
         """Convert simulated time in s to ticks."""

@@ -283,7 +283,7 @@ class AlarmConverter:
             words["what"] = escape_text(f"{code}: {measured}, {detail}")
         else:
             subject = self._name_subject(about, number, owner)
-            board = subject if alarm == Alarm.REJOINED else owner
+            board = subject if alarm in (Alarm.REJOINED, Alarm.SCHEDULER_KEPT) else owner
             if alarm == Alarm.SCHEDULER_KEPT:
                 words["scheduler"] = to_enum(Scheduler, value).word
                 words["what"] = escape_text(bytes(row["text"]).decode("utf-8", "replace"))

@@ -51,7 +51,8 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
         if why := reserve_time(scheduling.reservation, block[Block.PID]):
             raise LaunchError(
                 f"board.{task.task}.scheduler: {EARLIEST.word} refused: {why}; fixed-priority does"
-                " without"
+                " without",
+                2,
             )
     if plan.config.clock.on_no_realtime == "refuse" and (refusal := _find_refusal(plan, segment)):
         raise LaunchError(f'{refusal}, and clock.on_no_realtime is "refuse". {PERMIT}')

@@ -17,7 +17,6 @@ from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE_PORT, ExchangeRecord
-from rack.boards.run.scheduling import SchedulerCommands
 from rack.boards.run.simulated_cores import CoreStep
 from rack.boards.run.task import ClockGuard, Task, chain_accesses, slow_access
 from rack.boards.wiring import TaskWiring
@@ -67,15 +66,12 @@ class VirtualControlLoop(Task):
             record = ExchangeRecord(self.inputs.mailboxes, message).fill_message
         reads = chain_accesses(self.inputs.read_command_and_status, record)
         settings = executor.take_settings if executor.is_set_by_board else None
-        schedule = None
-        if wiring.scheduling is not None:
-            schedule = SchedulerCommands(segment, wiring, self.alarms).take_commands
-            if wiring.scheduling.cost_ns:
-                self.simulated.steps.append(CoreStep(self, wiring.scheduling.cost_ns))
         self.read_command_and_status = chain_accesses(
-            self.serve, slow_access(reads, times.read_ns), settings, schedule
+            self.serve, slow_access(reads, times.read_ns), settings
         )
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
+        if wiring.scheduling is not None and wiring.scheduling.cost_ns:
+            self.simulated.steps.append(CoreStep(self, wiring.scheduling.cost_ns))
 
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""

@@ -1,17 +1,18 @@
-"""Scheduler of a board: taken at the start, and changed by its operator between two cycles."""
+"""Scheduler of a board: the board takes it at the start, the clock changes it for an operator."""
 
 from __future__ import annotations
 
-from rack.backplane.mailbox.protocols import open_observer
+from collections.abc import Mapping, Sequence
+
+from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.process import DEADLINE, reserve_time, set_priority, take_core
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Scheduler, System
-from rack.boards.wiring import TaskWiring
-from rack.levels.operator import Operation
+from rack.boards.wiring import Scheduling, TaskWiring
 
 EARLIEST = Scheduler.EARLIEST_DEADLINE_FIRST
-BY_NAME = {scheduler.word: scheduler for scheduler in Scheduler}
+BY_WORD = {scheduler.word: scheduler for scheduler in Scheduler}
 
 
 def take_scheduled_core(segment: Segment, wiring: TaskWiring) -> None:
@@ -30,53 +31,59 @@ def take_scheduled_core(segment: Segment, wiring: TaskWiring) -> None:
     block[Block.CORE] = spec.core
 
 
-class SchedulerCommands:
-    """Changes the scheduler of a board as its operator commands.
+class SchedulerChanges:
+    """Changes the schedulers of tasks for operators. The clock does so, even if a task is starved.
 
     Args:
         segment: Memory of the rack.
-        wiring: Wiring of the board's executor.
-        alarms: Alarm ring of the executor.
+        tasks: The clock's access to the tasks.
+        schedulings: How executors compete for their cores, by task.
+        alarms: Alarm ring of the clock.
     """
 
-    def __init__(self, segment: Segment, wiring: TaskWiring, alarms: AlarmWriter) -> None:
-        self._block = segment.get_block(wiring.task)
-        self._words = segment.words
-        self._spec = segment.layout.find_task(wiring.task)
-        self._index = segment.layout.processes.index(self._spec)
-        self._scheduling = wiring.scheduling
+    def __init__(
+        self,
+        segment: Segment,
+        tasks: Sequence[ReleasedTask],
+        schedulings: Mapping[str, Scheduling],
+        alarms: AlarmWriter,
+    ) -> None:
+        self._tasks = {task.spec.name: task for task in tasks}
+        self._schedulings = schedulings
         self._alarms = alarms
-        self._commands = open_observer(segment, f"{self._spec.board}.operator")
+        self._is_lockstep = bool(segment.words[System.LOCKSTEP])
 
-    def take_commands(self, tick: int) -> None:
-        """Carry out the new commands that concern the scheduler."""
-        reading = self._commands.read(tick)
-        if not reading.is_new:
+    def change_scheduler(self, name: str, word: str, tick: int) -> None:
+        """Change the scheduler of an executor, or report why the system refuses.
+
+        Args:
+            name: Name of the executor, which is that of its board.
+            word: Name of its new scheduler. Any other word has no effect.
+            tick: Current tick.
+        """
+        scheduler = BY_WORD.get(word)
+        if scheduler is None or name not in self._schedulings:
             return
-        for message in (*reading.earlier, reading.message):
-            scheduler = BY_NAME.get(message.name)
-            if message.what == Operation.SCHEDULE and scheduler is not None:
-                if why := "" if self._words[System.LOCKSTEP] else self._switch_process(scheduler):
-                    self._alarms.raise_alarm(
-                        tick, Alarm.SCHEDULER_KEPT, self._index, scheduler, text=why
-                    )
-                else:
-                    self._block[Block.SCHEDULER] = scheduler
+        task = self._tasks[name]
+        if why := "" if self._is_lockstep else self._switch_process(task, scheduler):
+            self._alarms.raise_alarm(tick, Alarm.SCHEDULER_KEPT, task.index, scheduler, text=why)
+        else:
+            task.block[Block.SCHEDULER] = scheduler
 
-    def _switch_process(self, scheduler: Scheduler) -> str:
-        """Give this process another scheduler. Return why the system refuses, or an empty text."""
-        if scheduler is not EARLIEST:
-            is_refused = not set_priority(self._spec.priority)
-            self._block[Block.PRIORITY] = 0 if is_refused else self._spec.priority
-            return "SCHED_FIFO is not permitted" if is_refused else ""
-        # A clock with a priority would run below a board with a deadline on its core.
-        scheduling = self._scheduling
-        assert scheduling is not None, "the config names schedulers"
-        for pid, reservation in (
-            (self._words[System.CLOCK_PID], scheduling.clocks),
-            (0, scheduling.reservation),
-        ):
-            if reservation is not None and (why := reserve_time(reservation, pid)):
-                return why
-        self._block[Block.PRIORITY] = DEADLINE
+    def _switch_process(self, task: ReleasedTask, scheduler: Scheduler) -> str:
+        """Give the process of a task another scheduler. Return why the system refuses, or ""."""
+        pid = task.block[Block.PID]
+        priority = task.spec.priority
+        if scheduler is Scheduler.MAXIMUM_URGENCY_FIRST:
+            return "Linux has no such scheduler"
+        if scheduler is EARLIEST:
+            priority = DEADLINE
+            scheduling = self._schedulings[task.spec.name]
+            # A clock with a priority would run below a board with a deadline on its core.
+            for reservation, process in ((scheduling.clocks, 0), (scheduling.reservation, pid)):
+                if reservation is not None and (why := reserve_time(reservation, process)):
+                    return why
+        elif not set_priority(priority, pid):
+            return "SCHED_FIFO is not permitted"
+        task.block[Block.PRIORITY] = priority
         return ""

@@ -59,9 +59,9 @@ class SimulatedCores:
         self._wiring = wiring
         self._driver = driver
         self._clock_ns = clock_ns
-        self._tasks = {t.spec.name: t for t in driver.tasks if t.spec.name in wiring.loads}
+        self._tasks = {t.spec.name: t for t in driver.tasks if t.spec.name in wiring.schedulings}
         begin_ns = driver.first_tick * clock_ns
-        cores = {wiring.simulated_core, *(load.core for load in wiring.loads.values())}
+        cores = {wiring.simulated_core, *(load.core for load in wiring.schedulings.values())}
         self._cores = {core: SimulatedCore(begin_ns) for core in sorted(cores)}
 
     def run_tick(self, tick: int) -> None:
@@ -73,10 +73,13 @@ class SimulatedCores:
             core.jobs = [
                 job for job in core.jobs if job.task != CLOCK and not self._tasks[job.task].is_lost
             ]
+            for begun in core.jobs:
+                # An operator may have changed it.
+                begun.scheduler = Scheduler(self._tasks[begun.task].block[Block.SCHEDULER])
             if number == self._wiring.simulated_core and self._wiring.cost_ns:
                 core.jobs.append(self._build_clock_job(tick))
             under_way = {job.task for job in core.jobs}
-            for name, load in self._wiring.loads.items():
+            for name, load in self._wiring.schedulings.items():
                 if load.core == number and name not in under_way:
                     self._add_job(core, self._tasks[name], load, begin_ns)
             while (job := core.run_until(begin_ns + self._clock_ns)) is not None:
@@ -86,7 +89,7 @@ class SimulatedCores:
                     self._driver.resume_cycle(task)
                     # If the job has missed its deadline, the cycle waits once more.
                     self._driver.resume_cycles(tick)
-                    self._add_job(core, task, self._wiring.loads[job.task], core.now_ns)
+                    self._add_job(core, task, self._wiring.schedulings[job.task], core.now_ns)
 
     def _add_job(
         self, core: SimulatedCore, task: ReleasedTask, load: Scheduling, ready_at: int

@@ -28,12 +28,13 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System, is_switched_on
 from rack.boards.faults.clock_board import FaultStage
-from rack.boards.operator import build_hold_command
+from rack.boards.operator import build_hold_command, find_level
 from rack.boards.run.copying import Copier
+from rack.boards.run.scheduling import SchedulerChanges
 from rack.boards.run.simulated_cores import SimulatedCores
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import ClockWiring
-from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
+from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer, Operation
 
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
@@ -61,7 +62,8 @@ class SystemController:
         self._wiring = wiring
         self._driver = driver
         self._faults = FaultStage(segment, driver)
-        self._desk = OperatorCommandIssuer(segment, driver.alarms)
+        changes = SchedulerChanges(segment, driver.tasks, wiring.schedulings, driver.alarms)
+        self._desk = OperatorCommandIssuer(segment, driver.alarms, changes)
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
         self.cores: SimulatedCores | None = None
@@ -168,9 +170,11 @@ class OperatorCommandIssuer:
         next_tick: First tick with work to do, unless there are new requests.
     """
 
-    def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
+    def __init__(self, segment: Segment, alarms: AlarmWriter, changes: SchedulerChanges) -> None:
         self._words = segment.words
         self._alarms = alarms
+        self._changes = changes
+        self._layout = segment.layout
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
         self._boxes = segment.layout.mailboxes
@@ -228,6 +232,9 @@ class OperatorCommandIssuer:
         message.raw[:] = entry.message[: len(message.raw)]
         message.id = entry.serial
         writer.write(tick, self._clock.compute_tick())
+        if message.what == Operation.SCHEDULE:
+            board = find_level(entry, self._layout)
+            self._changes.change_scheduler(board, message.name, tick)
         entry.stage = RequestStage.GIVEN
         if message.what not in (*SETTINGS, *DRIVE_OPERATIONS):
             self._newest[entry.mailbox] = message.id
@@ -363,7 +370,7 @@ def run_clock(
     else:
         driver = RealtimeDriver(segment, end_of_run, alarms)
     driver.controller = controller = SystemController(segment, wiring, driver, end_of_run)
-    if isinstance(driver, LockstepDriver) and wiring.loads:
+    if isinstance(driver, LockstepDriver) and any(s.cost_ns for s in wiring.schedulings.values()):
         driver.permits_batches = False
         controller.cores = SimulatedCores(wiring, driver, segment.layout.clock_ns)
     driver.run()

@@ -88,7 +88,7 @@ class CoreJob:
     Attributes:
         task: Name of the task.
         release: Its release, as a tick.
-        scheduler: Scheduler of the task at the release.
+        scheduler: Scheduler of the task.
         priority: Fixed priority of the task.
         is_critical: Whether the task is critical.
         ready_at: Time in ns from which the job can run.
