@@ -50,8 +50,8 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
         # The board was refused. Ask once more for the reason.
         if why := reserve_time(scheduling.reservation, block[Block.PID]):
             raise LaunchError(
-                f"board.{task.task}.scheduler: {EARLIEST.word} refused: {why}; fixed-priority does"
-                " without",
+                f"board.{task.task}.scheduler: {EARLIEST.word} refused: {why}; otherwise use"
+                " fixed-priority",
                 2,
             )
     if plan.config.clock.on_no_realtime == "refuse" and (refusal := _find_refusal(plan, segment)):

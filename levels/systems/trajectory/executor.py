@@ -232,10 +232,10 @@ class TrajectoryExecutor(Executor):
 
     def _find_wait_reason(self) -> str:
         """Return why the motion does not continue, or an empty string if it does."""
-        if not self._boards.in_step:
-            return self._boards.wait_reason
         if self._failure:
             return self._failure
+        if not self._boards.in_step:
+            return self._boards.wait_reason
         if self._orders.is_in_force:
             return self._orders.format_reason(self.context.board)
         if self._agenda.is_request_missing:
