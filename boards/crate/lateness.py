@@ -45,9 +45,9 @@ def find_late_tasks(segment: Segment, config: RackConfig, end: int) -> tuple[lis
         counts = segment.count_cycles(task, end)
         disturbed = []
         for fault in faults:
-            recovery = find_kind(fault).compute_recovery_ticks(
-                find_board(fault, layout), layout, restart_s
-            )
+            kind = find_kind(fault)
+            recovery = kind.compute_recovery_ticks(find_board(fault, layout), layout, restart_s)
+            recovery += kind.compute_tail_ticks(fault, layout)
             # The cycle in progress at the first effect of the fault may also be lost.
             first = max(0, fault.struck_tick - task.slice + 1)
             disturbed.append((first, min(end, fault.until + recovery)))

@@ -31,8 +31,8 @@ from rack.boards.faults.message_steps import Babble, forge_message
 OPEN_STAGES = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
 """Number of phases in a tick: a phase of 500 is the middle of the tick."""
-MIN_LATENESS_TICKS = 0.6
-"""Smallest delay of a late tick, in ticks. Boards report a tick that is at least 0.5 late."""
+REPORTED_TICKS = 0.5
+"""Delay in ticks from which boards report a late tick."""
 
 
 Strike = Callable[["FaultStage", FaultEntry, int], None]
@@ -129,16 +129,17 @@ def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _draw_lateness(entry: FaultEntry, tick: int) -> float:
-    """Return the lateness of a tick, between `MIN_LATENESS_TICKS` and the fault's parameter."""
-    return random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
+    """Return the lateness of a tick, between the fault's parameters."""
+    most, least, *_ = entry.parameters
+    return random.Random(entry.seed + tick).uniform(min(least, most), most)
 
 
 def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Delay a tick by a random part of its period. In lockstep, each task computes its lateness."""
-    entry.record_action(tick)
+    delay = _draw_lateness(entry, tick)
+    entry.record_action(tick, delay > REPORTED_TICKS)
     if stage.clock.is_lockstep:
         return
-    delay = _draw_lateness(entry, tick)
     until_ns = stage.clock.compute_time_ns(tick) + int(delay * stage.clock.period_ns)
     # The delay is less than a tick period, so the clock's grid is not shifted.
     time.sleep(max(0, until_ns - time.monotonic_ns()) * 1e-9)

@@ -202,6 +202,17 @@ class Kind:
         needs_reader = self.takes_mailbox or (self.detected_as == (DIED,) and reader is not None)
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
+    def compute_tail_ticks(self, fault: FaultEntry | Injection, layout: Layout) -> int:
+        """Compute the time for which the last cycle that a fault makes longer outlasts the fault.
+
+        Returns:
+            The time in ticks. 0 for faults that make no cycle longer.
+        """
+        if self.where != "load":
+            return 0
+        task = layout.processes[fault.task]
+        return task.slice + ceil(self.read_parameters(fault).get("by", 0.0) * task.every)
+
     def compute_recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
         """Compute the time within which the rack must have recovered.
 

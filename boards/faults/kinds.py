@@ -347,15 +347,18 @@ KINDS.add(
             Parameter(
                 "late",
                 "ticks",
-                "largest delay of a tick; the smallest is 0.6",
+                "largest delay of a tick",
                 0.9,
-                0.65,
+                0.01,
                 0.95,
                 drawn=draw.uniform_number(0.75, 0.95),
             ),
+            Parameter("least", "ticks", "smallest delay of a tick", 0.6, 0.0, 0.95),
         ),
         detected_as=(Alarm.CLOCK_LATE,),
         bound=bounds.tick_bound(2),
+        # In lockstep a simulated arm is sampled and driven late, unlike its model.
+        consequence=Consequence(arm=(Alarm.SENSOR_MODEL, Alarm.ACTUATOR), recovery_s=1.0),
         lasts=draw.uniform_seconds(0.2, 0.6),
     ),
     _sensor(

@@ -210,7 +210,11 @@ class Judge:
 
     def _compute_recovery(self, strike: Strike) -> int:
         """Return the time in ticks within which the rack must have recovered from a fault."""
-        return strike.record.compute_recovery_ticks(strike.board, self._layout, self._run.restart_s)
+        record = strike.record
+        ticks = record.compute_recovery_ticks(strike.board, self._layout, self._run.restart_s)
+        if strike.injection is not None:
+            ticks += record.compute_tail_ticks(strike.injection, self._layout)
+        return ticks
 
     def _compute_window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick at which an event may be caused by a fault."""

@@ -99,7 +99,7 @@ class RackUnderTest:
         duration = kind.compute_bound_ticks(entry, layout) or 0
         if not kind.ends_when_detected:
             min_duration = 2 * target.cycle + target.reader if target.mailbox else MIN_TICKS
-            duration = max(duration, ticks, min_duration)
+            duration = max(duration, ticks + kind.compute_tail_ticks(entry, layout), min_duration)
         recovery = kind.compute_recovery_ticks(target.board, layout, self.restart_s)
         return duration + recovery + round(SETTLE_S * self.second)
 

@@ -14,6 +14,7 @@ from rack.tools.lab.reproduction.experiments import (
     partition,
     response,
     sharing,
+    smoothness,
     speedup,
     switch,
     tasks,
@@ -269,6 +270,16 @@ SECTIONS = (
                 " processing and communication.",
                 "fig4",
                 build_settings("fig4", 3.0),
+            ),
+            PaperClaim(
+                "smooth-motion",
+                "Smooth motion",
+                "Smooth motion results from an efficient input-compute-output cycle that maintains"
+                " a small standard deviation each cycle with an upper bound ... on variance.",
+                "Error, jerk and brakings grew with jitter, with overruns beyond the residual and"
+                " with the cycle; overruns within the residual changed nothing.",
+                (smoothness.SMOOTHNESS,),
+                rules.judge_smoothness,
             ),
         ),
     ),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from math import ceil, inf
 
@@ -28,6 +29,11 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 from rack.tools.lab.reproduction.experiments.partition import Partition, PartitionFigures
 from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
+from rack.tools.lab.reproduction.experiments.smoothness import (
+    RESOLUTION_RAD,
+    MotionPoint,
+    SmoothnessRun,
+)
 from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import (
@@ -281,6 +287,47 @@ def judge_sum(run: NasremRun) -> ClaimVerdict:
         here=check_none(beyond_grid_without_miss=unexplained),
         needs=[compare_value("ways", len(checks), "=", 2)],
     )
+
+
+def judge_smoothness(run: SmoothnessRun) -> ClaimVerdict:
+    """Check that motion becomes rougher with the deviation and with the length of the cycle.
+
+    From point to point of each sweep, tracking error, jerk and number of brakings must not fall,
+    except for the resolution of the encoders, and error and jerk must rise over the sweep. An
+    overrun within the residual must change nothing. The brakes must engage at the largest jitter.
+    """
+    still = run.undisturbed
+    within = [point for point in run.overrun if point.value < 1.0]
+    beyond = [point for point in run.overrun if point.value >= 1.0]
+    changed = sum(replace(point, value=still.value) != still for point in within)
+    sweeps = {"jitter": run.jitter, "overrun": beyond, "rate": run.rate}
+    return rule_on(
+        *check_none(overruns_within_residual_that_change=changed),
+        *(check for name, points in sweeps.items() for check in _check_growth(name, still, points)),
+        compare_value("brakings_at_largest_jitter", run.jitter[-1].brakings, ">=", 1),
+        needs=[
+            compare_value("moved_rad", still.moved_rad, ">", 1.0),
+            compare_value("brakings_undisturbed", still.brakings, "=", 0),
+            compare_value("overruns_within_residual", len(within), ">=", 1),
+            compare_value("fewest_points", min(map(len, sweeps.values())), ">=", 2),
+        ],
+    )
+
+
+def _check_growth(name: str, still: MotionPoint, points: Sequence[MotionPoint]) -> Iterator[Check]:
+    """Yield the checks that the motion is rougher at each point of a sweep than before."""
+    steps = list(pairwise((still, *points)))
+    least_mrad = 1e3 * RESOLUTION_RAD
+    falls = {
+        "error": sum(now.error_mrad < before.error_mrad - least_mrad for before, now in steps),
+        "jerk": sum(now.jerk_rad_s3 < before.jerk_rad_s3 for before, now in steps),
+        "brakings": sum(now.brakings < before.brakings for before, now in steps),
+    }
+    yield from check_none(**{f"{name}_falls_of_{what}": count for what, count in falls.items()})
+    last = points[-1]
+    grown_mrad = still.error_mrad + least_mrad
+    yield compare_value(f"{name}_error_mrad", last.error_mrad, ">", grown_mrad)
+    yield compare_value(f"{name}_jerk_rad_s3", last.jerk_rad_s3, ">", still.jerk_rad_s3)
 
 
 def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict:
