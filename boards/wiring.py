@@ -191,8 +191,6 @@ class ClockWiring:
         reservation: Processor time to reserve instead of a priority, None for none.
         schedulings: How executors compete for their cores, by task. Empty if the config names no
             scheduler.
-        simulated_core: Simulated core of the clock.
-        cost_ns: Simulated processor time of the clock in each tick.
     """
 
     lockstep: bool
@@ -209,5 +207,3 @@ class ClockWiring:
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
     schedulings: Mapping[str, Scheduling]
-    simulated_core: int
-    cost_ns: int

@@ -17,9 +17,8 @@ from rack.backplane.words import Scheduler
 from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
-from rack.boards.config.rules.boards import list_reservation_mistakes
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.config.timing import compute_first_tick
+from rack.boards.config.timing import compute_first_tick, list_reservation_mistakes
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError

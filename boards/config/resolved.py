@@ -164,8 +164,6 @@ class Resolved:
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
             schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
-            simulated_core=clock.core,
-            cost_ns=round(config.timing.lockstep_load * config.timing.clock_ms * 1e6),
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )

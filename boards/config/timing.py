@@ -11,12 +11,14 @@ from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import get_interrupt_spec
 from rack.backplane.process import Reservation
 from rack.backplane.words import Scheduler
+from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.schema import (
     BudgetConfig,
     CommandConfig,
     RackConfig,
     ScheduleConfig,
 )
+from rack.boards.errors import Mistake, Mistakes
 from rack.boards.faults.config import FaultConfig
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming
@@ -198,6 +200,28 @@ def _compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Rese
         return None
     period_ns = every * config.tick_ns
     return Reservation(min(round(RESERVED_BUDGETS * busy_ms * NS_PER_MS), period_ns), period_ns)
+
+
+def list_reservation_mistakes(config: RackConfig, name: str, key: str) -> Mistakes:
+    """Yield why a board cannot reserve processor time, as earliest deadline first requires.
+
+    Args:
+        config: The config of the rack.
+        name: The board.
+        key: Key that chooses the scheduler.
+    """
+    board = config.board[name]
+    place = f"board.{name}"
+    if not board.busy_ms:
+        yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
+    if (board.wake or config.clock.wake) == "poll":
+        yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
+    if board.coupling == "tight":
+        why = "a planner with the executor's priority would run below all reservations"
+        yield Mistake(f"{place}.coupling", "tight", why)
+    if board.executor == LAN_ADAPTER:
+        why = "the network adapter's threads need its priority; use fixed-priority"
+        yield Mistake(key, Scheduler.EARLIEST_DEADLINE_FIRST.word, why)
 
 
 def compute_first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:

@@ -9,6 +9,7 @@ cycles.
 
 from __future__ import annotations
 
+from importlib import import_module
 from time import monotonic_ns
 
 from rack.backplane.process import set_priority
@@ -17,12 +18,12 @@ from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE_PORT, ExchangeRecord
-from rack.boards.run.simulated_cores import CoreStep
 from rack.boards.run.task import ClockGuard, Task, chain_accesses, slow_access
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ArmState
 
+SIMULATED_CORES = "rack.boards.run.simulated_cores"
 _DEMANDS = tuple(Demand)
 
 
@@ -71,7 +72,9 @@ class VirtualControlLoop(Task):
         )
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
         if wiring.scheduling is not None and wiring.scheduling.cost_ns:
-            self.simulated.steps.append(CoreStep(self, wiring.scheduling.cost_ns))
+            # Import it only in racks that need it.
+            step = import_module(SIMULATED_CORES).CoreStep(self, wiring.scheduling.cost_ns)
+            self.simulated.steps.append(step)
 
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""

@@ -1,34 +1,18 @@
-"""Scheduler of a board: the board takes it at the start, the clock changes it for an operator."""
+"""Changes of a board's scheduler by an operator, while the rack runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 from rack.backplane.clock.released_task import ReleasedTask
-from rack.backplane.process import DEADLINE, reserve_time, set_priority, take_core
+from rack.backplane.process import DEADLINE, reserve_time, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Scheduler, System
-from rack.boards.wiring import Scheduling, TaskWiring
+from rack.boards.wiring import Scheduling
 
 EARLIEST = Scheduler.EARLIEST_DEADLINE_FIRST
 BY_WORD = {scheduler.word: scheduler for scheduler in Scheduler}
-
-
-def take_scheduled_core(segment: Segment, wiring: TaskWiring) -> None:
-    """Pin the calling process to the core of its task, and give it the task's scheduler.
-
-    After a restart this is the scheduler that the previous process had.
-    """
-    spec = segment.layout.find_task(wiring.task)
-    block = segment.get_block(wiring.task)
-    reservation = None
-    if wiring.scheduling is not None:
-        block[Block.SCHEDULER] = block[Block.SCHEDULER] or wiring.scheduling.scheduler
-        if block[Block.SCHEDULER] == EARLIEST:
-            reservation = wiring.scheduling.reservation
-    block[Block.PRIORITY] = take_core(spec.core, spec.priority, reservation)
-    block[Block.CORE] = spec.core
 
 
 class SchedulerChanges:

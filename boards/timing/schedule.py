@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
-from rack.boards.timing.scheduler import Urgency, simulate_core
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
@@ -126,6 +126,52 @@ def simulate_schedule(
         key=lambda job: (job.release_ns, job.task),
     )
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
+
+
+Urgency = tuple[Any, ...]
+"""Key of a ready task. The task with the smallest key runs."""
+
+
+class CoreTask(Protocol):
+    """A task or job that competes for a core."""
+
+    @property
+    def ready_at(self) -> int:
+        """Time in ns from which it can run."""
+
+    def get_urgency(self, now_ns: int) -> Urgency:
+        """Return its urgency at a time."""
+
+    def run_step(self, now_ns: int, until_ns: int) -> int:
+        """Run it until a part of it or the time is over, and return the end in ns."""
+
+
+AnyCoreTask = TypeVar("AnyCoreTask", bound=CoreTask)
+
+
+def simulate_core(
+    tasks: Sequence[AnyCoreTask], start_ns: int, until_ns: int
+) -> Iterator[tuple[int, AnyCoreTask]]:
+    """Simulate one core. At each release and end of a part, choose the task to run.
+
+    Args:
+        tasks: The tasks of the core.
+        start_ns: Start of the simulation.
+        until_ns: End of the simulation.
+
+    Yields:
+        The end of each step in ns, and the task that ran.
+    """
+    now = start_ns
+    while now < until_ns:
+        ready = [task for task in tasks if task.ready_at <= now]
+        next_release = min((t.ready_at for t in tasks if t.ready_at > now), default=until_ns)
+        if not ready:
+            now = next_release
+            continue
+        first = min(ready, key=lambda task: task.get_urgency(now))
+        now = first.run_step(now, min(next_release, until_ns))
+        yield now, first
 
 
 class _TaskSimulation:

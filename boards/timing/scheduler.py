@@ -8,14 +8,10 @@ Real-Time Operating Systems and Software (1991).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
 
 from rack.backplane.words import Scheduler
-
-Urgency = tuple[Any, ...]
-"""Key of a ready task. The task with the smallest key runs."""
+from rack.boards.timing.schedule import Urgency, simulate_core
 
 
 def compute_urgency(
@@ -37,48 +33,6 @@ def compute_urgency(
             return -scheduler, deadline_ns, -priority
         case Scheduler.MAXIMUM_URGENCY_FIRST:
             return -scheduler, not is_critical, laxity_ns, -priority
-
-
-class CoreTask(Protocol):
-    """A task or job that competes for a core."""
-
-    @property
-    def ready_at(self) -> int:
-        """Time in ns from which it can run."""
-
-    def get_urgency(self, now_ns: int) -> Urgency:
-        """Return its urgency at a time."""
-
-    def run_step(self, now_ns: int, until_ns: int) -> int:
-        """Run it until a part of it or the time is over, and return the end in ns."""
-
-
-AnyCoreTask = TypeVar("AnyCoreTask", bound=CoreTask)
-
-
-def simulate_core(
-    tasks: Sequence[AnyCoreTask], start_ns: int, until_ns: int
-) -> Iterator[tuple[int, AnyCoreTask]]:
-    """Simulate one core. At each release and end of a part, choose the task to run.
-
-    Args:
-        tasks: The tasks of the core.
-        start_ns: Start of the simulation.
-        until_ns: End of the simulation.
-
-    Yields:
-        The end of each step in ns, and the task that ran.
-    """
-    now = start_ns
-    while now < until_ns:
-        ready = [task for task in tasks if task.ready_at <= now]
-        next_release = min((t.ready_at for t in tasks if t.ready_at > now), default=until_ns)
-        if not ready:
-            now = next_release
-            continue
-        first = min(ready, key=lambda task: task.get_urgency(now))
-        now = first.run_step(now, min(next_release, until_ns))
-        yield now, first
 
 
 @dataclass

@@ -22,7 +22,7 @@ from rack.boards.config.schema import (
     RackConfig,
     ScheduleConfig,
 )
-from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
+from rack.boards.config.timing import PLANNER_BUDGET, compute_frames, list_reservation_mistakes
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
@@ -285,28 +285,6 @@ def check_schedulers(wiring: Wiring) -> Mistakes:
         if load and board.planner is not None:
             why = f"'{name}' has a planner, which would take no simulated time"
             yield Mistake("timing.lockstep_load", load, why)
-
-
-def list_reservation_mistakes(config: RackConfig, name: str, key: str) -> Mistakes:
-    """Yield why a board cannot reserve processor time, as earliest deadline first requires.
-
-    Args:
-        config: The config of the rack.
-        name: The board.
-        key: Key that chooses the scheduler.
-    """
-    board = config.board[name]
-    place = f"board.{name}"
-    if not board.busy_ms:
-        yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
-    if (board.wake or config.clock.wake) == "poll":
-        yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
-    if board.coupling == "tight":
-        why = "a planner with the executor's priority would run below all reservations"
-        yield Mistake(f"{place}.coupling", "tight", why)
-    if board.executor == LAN_ADAPTER:
-        why = "the network adapter's threads need its priority; use fixed-priority"
-        yield Mistake(key, Scheduler.EARLIEST_DEADLINE_FIRST.word, why)
 
 
 def check_schedule(wiring: Wiring) -> Mistakes:
