@@ -129,38 +129,51 @@ class Reservation(NamedTuple):
 def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
     """Pin the calling process to a core and raise its priority, if allowed.
 
-    If the kernel grants the reservation only to an unpinned process, the process is not pinned.
-
     Args:
         core: Processor core.
         priority: SCHED_FIFO priority, used if there is no reservation or the system refuses it.
-        reservation: Processor time to reserve under SCHED_DEADLINE.
+        reservation: Processor time to reserve on the core under SCHED_DEADLINE.
 
     Returns:
         The SCHED_FIFO priority obtained, `DEADLINE` for the reservation, or 0 for ordinary
             scheduling.
     """
-    everywhere = os.sched_getaffinity(0)
     pin_to_core(core)
-    if reservation is not None:
-        # The kernel refuses a reservation to a pinned process if it checks the sum of reservations
-        # over all cores. In that case, try again unpinned.
-        for cores in ({core}, everywhere):
-            os.sched_setaffinity(0, cores)
-            if _reserve_time(reservation):
-                return DEADLINE
-        pin_to_core(core)
+    if reservation is not None and not reserve_time(reservation):
+        return DEADLINE
     return priority if set_priority(priority) else 0
 
 
-def _reserve_time(reservation: Reservation) -> bool:
-    """Switch to SCHED_DEADLINE. Returns False if the system refuses."""
+def reserve_time(reservation: Reservation, pid: int = 0) -> str:
+    """Switch a process to SCHED_DEADLINE on the core to which it is pinned.
+
+    Args:
+        reservation: Processor time to reserve.
+        pid: The process, 0 for the calling one.
+
+    Returns:
+        Why the system refuses. Empty if it does not.
+    """
     runtime_ns, period_ns = reservation
     times = runtime_ns, period_ns, period_ns
     record = Struct("=IIQiIQQQ")
     attributes = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
     number = _SCHED_SETATTR.get(platform.machine())
-    return number is not None and _libc.syscall(number, 0, attributes, 0) == 0
+    if number is None:
+        return f"not known on {platform.machine()}"
+    if _libc.syscall(number, pid, attributes, 0) == 0:
+        return ""
+    code = ctypes.get_errno()
+    return (
+        f"{os.strerror(code)}; {PERMITS_RESERVATIONS}" if code == errno.EPERM else os.strerror(code)
+    )
+
+
+PERMITS_RESERVATIONS = (
+    "time on one core is reserved only as root, with kernel.sched_rt_runtime_us = -1 or in an"
+    " exclusive cpuset"
+)
+"""Advice on obtaining reservations."""
 
 
 def disable_timer_slack() -> None:
@@ -220,16 +233,20 @@ def describe_refusal(error: OSError) -> str:
     return f"{error.strerror}: the limit is {maximum} {resource} (ulimit -{option})"
 
 
-def set_priority(priority: int) -> bool:
-    """Set the SCHED_FIFO priority of the calling process. 0 selects ordinary scheduling.
+def set_priority(priority: int, pid: int = 0) -> bool:
+    """Set the SCHED_FIFO priority of a process. 0 selects ordinary scheduling.
+
+    Args:
+        priority: The priority.
+        pid: The process, 0 for the calling one.
 
     Returns:
         False if the system refuses.
     """
     policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
     try:
-        os.sched_setscheduler(0, policy, os.sched_param(priority))
-    except PermissionError:
+        os.sched_setscheduler(pid, policy, os.sched_param(priority))
+    except (PermissionError, ProcessLookupError):
         return False
     return True
 

@@ -189,6 +189,10 @@ class Block:
     # In lockstep, tick at which a cycle that takes simulated time goes on, 0 for none. Set by the
     # task, which then waits, and cleared by the clock.
     FINISH = 31
+    SCHEDULER = 32  # Scheduler of an executor, 0 if the rack's config names none
+    # In lockstep, processor time in ns of the cycle that waits for the end of its job on a
+    # simulated core.
+    COMPUTING_NS = 33
 
 
 class TaskState(IntEnum):
@@ -201,6 +205,28 @@ class TaskState(IntEnum):
     ENDED = 4
     FAILED = 5
     GIVEN_UP = 6  # lost, and not to be restarted; written by the Rack
+
+
+class Scheduler(IntEnum):
+    """Values of `Block.SCHEDULER`: how a task competes for its core.
+
+    On one core, tasks with a greater value precede those with a smaller one, as SCHED_DEADLINE
+    precedes SCHED_FIFO.
+    """
+
+    FIXED_PRIORITY = 1
+    EARLIEST_DEADLINE_FIRST = 2
+    MAXIMUM_URGENCY_FIRST = 3
+
+    @property
+    def word(self) -> str:
+        """Name in configs and commands, such as "fixed-priority"."""
+        return self.name.lower().replace("_", "-")
+
+    @classmethod
+    def find(cls, word: str) -> Scheduler:
+        """Return the scheduler of a name in a config. Raises `KeyError` if there is none."""
+        return cls[word.upper().replace("-", "_")]
 
 
 class Box:

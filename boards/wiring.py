@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.process import Reservation
-from rack.backplane.words import Demand
+from rack.backplane.words import Demand, Scheduler
 from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
@@ -86,6 +86,28 @@ class Continuation:
 
 
 @dataclass(frozen=True)
+class Scheduling:
+    """How the executor of a board competes for its core.
+
+    Attributes:
+        core: The core that the config requests.
+        scheduler: Its scheduler at the launch.
+        is_critical: Whether maximum urgency first runs it before others.
+        cost_ns: In lockstep, simulated processor time of a cycle. 0 if it takes none.
+        reservation: In real time, processor time to reserve under earliest deadline first. None
+            without a budget.
+        clocks: The same of the clock if it is on this core.
+    """
+
+    core: int
+    scheduler: Scheduler
+    is_critical: bool
+    cost_ns: int
+    reservation: Reservation | None
+    clocks: Reservation | None
+
+
+@dataclass(frozen=True)
 class TaskWiring:
     """Wiring of one task.
 
@@ -105,7 +127,7 @@ class TaskWiring:
         transfer: Minimum processor time of bus accesses.
         exchange: Rules for input ports that are read at a different rate or asynchronously. If
             there are any, the task writes its mailbox `<board>.exchange`.
-        reservation: Processor time to reserve instead of a priority, None for none.
+        scheduling: How the task competes for its core. None for a fixed priority that stays.
         budget_ns: Budgeted processor time of a cycle or plan. 0 without a budget.
     """
 
@@ -121,7 +143,7 @@ class TaskWiring:
     entries: RecordedEntries | None
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
-    reservation: Reservation | None
+    scheduling: Scheduling | None
     budget_ns: int
 
 
@@ -170,6 +192,8 @@ class ClockWiring:
         restart_ticks: In lockstep, time from the loss of a board until it rejoins.
         on_loss: Stop required of the arm while a task is lost, keyed by task.
         reservation: Processor time to reserve instead of a priority, None for none.
+        schedulings: How executors compete for their cores, by task. Empty if the config names no
+            scheduler.
     """
 
     lockstep: bool
@@ -186,3 +210,4 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
+    schedulings: Mapping[str, Scheduling]

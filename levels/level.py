@@ -8,6 +8,7 @@ Every level
 - An exception ends the board, which is restarted as a new process with a new object. State that
   must survive a restart is read back from your own mailboxes:
   `before = Input(MyStatus, "own.status")`.
+- After a missed deadline the board calls `handle_missed_deadline`, which may bring the arm to rest.
 - `tick` may advance by more than `context.every`, because cycles are skipped after a miss. Compute
   elapsed time from `tick` and never read a clock. Draw random numbers from `context.seed` and
   `tick`. Otherwise lockstep runs differ.
@@ -529,6 +530,17 @@ class Executor(LevelSection, ABC):
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults. `faults` contains all faults that are now active."""
+
+    def handle_missed_deadline(self, tick: int, skipped: int) -> None:
+        """React to a missed deadline, before the first cycle after it reads its inputs.
+
+        By default, do nothing.
+
+        Args:
+            tick: Release tick of that cycle.
+            skipped: Number of releases skipped before it. 0 if the last cycle ended too late, but
+                before the next release expired.
+        """
 
     @abstractmethod
     def process(self, tick: int) -> None:

@@ -46,6 +46,7 @@ class Operation(IntEnum):
     RESET = 10  # reset the fault of the arm's drives
     RELEASE = 11  # end the bring-up and permit full speed
     SET = 12  # set a live parameter of the level; `name` is key=value
+    SCHEDULE = 13  # change the scheduler of the level's board, which does this, to `name`
 
 
 class Goal(IntEnum):
@@ -60,7 +61,7 @@ class Goal(IntEnum):
     OFF = 6
 
 
-SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET)
+SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET, Operation.SCHEDULE)
 """Operations that are done at once and do not replace the command in force (see `Orders`).
 
 Each gives the name of what it sets.
@@ -240,7 +241,7 @@ class Orders:
             replaced = self.in_force
             if self._accept_command(message):
                 taken = taken or message.what not in (*SETTINGS, *DRIVE_OPERATIONS)
-                if judge is not None:
+                if judge is not None and message.what != Operation.SCHEDULE:
                     judge(message)
             if self.in_force != replaced:
                 self._news = [answer for answer in self._news if answer.serial != replaced]
@@ -255,9 +256,9 @@ class Orders:
         self.serial = message.id
         operation = message.what
         goal = message.goal
-        if operation not in self._commands or goal not in (
-            self._commands[Operation(operation)] or (Goal.NONE,)
-        ):
+        # The board, not the level, changes its scheduler.
+        known = {**self._commands, Operation.SCHEDULE: ()}
+        if operation not in known or goal not in (known[Operation(operation)] or (Goal.NONE,)):
             self.refuse_newest(
                 f"{describe_command(operation, goal)} is not a command of this level; permitted:"
                 f" {format_commands(self._commands)}"

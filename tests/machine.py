@@ -38,7 +38,7 @@ def obtains_fifo() -> bool:
 
 
 def obtains_deadlines() -> bool:
-    """Say whether this machine lets a process reserve processor time."""
+    """Say whether this machine lets a process reserve processor time on its core."""
     pid = os.fork()
     if not pid:
         is_given = take_core(min(os.sched_getaffinity(0)), 0, Reservation(100_000, 10_000_000))
@@ -53,7 +53,9 @@ def stolen() -> int:
 
 
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
-needs_deadlines = pytest.mark.skipif(not obtains_deadlines(), reason="needs SCHED_DEADLINE")
+needs_deadlines = pytest.mark.skipif(
+    not obtains_deadlines(), reason="needs SCHED_DEADLINE on one core"
+)
 needs_two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 needs_lab = pytest.mark.skipif(bool(Lab.is_possible()), reason=Lab.is_possible())
 

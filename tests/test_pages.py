@@ -88,6 +88,7 @@ OTHER_TESTS = {
     "rack run cell --share": "test_cell_page.py",
     "rack replay runs/<puma> runs/<k1607>": "tools/viewer/test_merged.py",
     "rack prompt chimera": "tools/monitor/test_host_side.py",
+    "rack command chimera trajectory schedule earliest-deadline-first": "test_chimera.py",
     "rack estop 10.0.0.1/cell": "tools/network/test_estop.py",
     "rack estop 10.0.0.1/cell --ready": "tools/network/test_estop.py",
     "rack campaign nasrem --injections 20 --seed 1": "tools/commands/test_campaign.py",

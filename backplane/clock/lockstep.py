@@ -174,7 +174,7 @@ class LockstepDriver(ClockDriver):
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check_tasks(due, tick)
-        if not self._resume_cycles(tick):
+        if not self.resume_cycles(tick):
             return False
         order = self._last_first
         slowest = None
@@ -194,26 +194,26 @@ class LockstepDriver(ClockDriver):
             order.insert(0, slowest)
         return True
 
-    def _resume_cycles(self, tick: int) -> bool:
+    def resume_cycles(self, tick: int) -> bool:
         """Let each cycle that takes simulated time until `tick` go on, and wait for its end.
+
+        Returns:
+            False if the launcher has ended or the host requests the end of the run.
+        """
+        due = (task for task in self.tasks if 0 < task.block[Block.FINISH] <= tick)
+        return all(self.resume_cycle(task) for task in due)
+
+    def resume_cycle(self, task: ReleasedTask) -> bool:
+        """Let the cycle of a task that waits go on, and wait until it has ended or waits again.
 
         Its messages may be visible from the next tick, before the task's deadline.
 
         Returns:
             False if the launcher has ended or the host requests the end of the run.
         """
-        for task in self.tasks:
-            if 0 < task.block[Block.FINISH] <= tick:
-                done = task.block[Block.DONE]
-                task.resume()
-                if not self.await_state(
-                    task,
-                    lambda task=task, done=done: (  # type: ignore[misc]
-                        task.block[Block.DONE] != done or task.is_settled()
-                    ),
-                ):
-                    return False
-        return True
+        done = task.block[Block.DONE]
+        task.resume()
+        return self.await_state(task, lambda: task.block[Block.DONE] != done or task.is_settled())
 
     def wait_until_settled(self) -> None:
         """Wait until every task has finished its last release, including plans."""

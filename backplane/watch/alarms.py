@@ -62,6 +62,8 @@ class Alarm(IntEnum):
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release
     PLAN_LATE = 11  # [task; releases missed]  a plan has not finished within its cycles (eq. 3.8)
     STARVED = 12  # [task; releases missed]  a task that could run does not get its core
+    # [task; Scheduler]  the system refuses another scheduler of a task, see the text
+    SCHEDULER_KEPT = 13
     # Raised by readers: mailboxes.
     STALE = 20  # [mailbox; age, ticks]  its writer is dead or stopped
     MUTE = 21  # [mailbox; age, ticks]  its writer is running but not writing

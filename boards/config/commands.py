@@ -13,11 +13,12 @@ from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.operator_table import Request
+from rack.backplane.words import Scheduler
 from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.config.timing import compute_first_tick
+from rack.boards.config.timing import compute_first_tick, list_reservation_mistakes
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError
@@ -158,6 +159,8 @@ def _check_command(
     yield from _check_goal(at, command, known)
     if command.operation is Operation.SET:
         yield from _check_setting(place, command, level)
+    elif command.operation is Operation.SCHEDULE:
+        yield from _check_scheduler(at("name"), command, config)
     else:
         yield from _check_name(at("name"), command, level)
     if command.joints is not None and Goal.JOINTS in known[command.operation]:
@@ -242,6 +245,15 @@ def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) ->
         table.model_validate(setting)
     except ValidationError as error:
         yield from convert_errors(error, table, setting, params)
+
+
+def _check_scheduler(place: str, command: CommandConfig, config: RackConfig) -> Mistakes:
+    """Check that a command `schedule` names a scheduler that the board can have."""
+    if command.name not in config.valid_schedulers:
+        why = f"no scheduler in this clock mode; valid: {', '.join(config.valid_schedulers)}"
+        yield Mistake(place, command.name, why)
+    elif command.name == Scheduler.EARLIEST_DEADLINE_FIRST.word:
+        yield from list_reservation_mistakes(config, command.level, place)
 
 
 def _check_joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:

@@ -262,7 +262,8 @@ class Wiring:
     def operator_mailboxes(self) -> list[str]:
         """Mailboxes through which an operator commands levels."""
         classes = find_executors(self.config).items()
-        return [f"{board}.operator" for board, kind in classes if has_operator_port(kind)]
+        is_any = self.config.names_schedulers
+        return [f"{board}.operator" for board, kind in classes if is_any or has_operator_port(kind)]
 
     @cached_property
     def types(self) -> dict[str, MessageType]:

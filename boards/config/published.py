@@ -153,7 +153,7 @@ def gather_facts(config: RackConfig) -> PublishedRack:
 
 def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
     """Return the facts to be published about the level of one board."""
-    commands = kind.commands if has_operator_port(kind) else {}
+    commands = dict(kind.commands) if has_operator_port(kind) else {}
     params = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := list_live_keys(kind.params)):
@@ -164,7 +164,10 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
             launched = read_params(kind.params, params)
         live = {key: _describe_param(declared[key], getattr(launched, key, "")) for key in keys}
     wording = {Operation.SET: tuple(live)}
-    for what in commands.keys() & {*NAMED_OPERATIONS} - {Operation.SET}:
+    if config.names_schedulers:
+        commands[Operation.SCHEDULE] = ()
+        wording[Operation.SCHEDULE] = config.valid_schedulers
+    for what in commands.keys() & {*NAMED_OPERATIONS} - wording.keys():
         # A state table may be invalid while it is being edited.
         with suppress(LevelError):
             wording[what] = tuple(kind.list_operation_names(what, params, config.scene))

@@ -23,7 +23,7 @@ from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
-from rack.boards.config.timing import compute_reservation, is_critical
+from rack.boards.config.timing import build_scheduling, compute_clock_reservation, is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -158,7 +158,8 @@ class Resolved:
             core=core,
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
-            reservation=compute_reservation(config, config.timing.clock_ms, 1),
+            reservation=compute_clock_reservation(config),
+            schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
@@ -304,9 +305,8 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            # Only executors reserve processor time.
-            reservation=compute_reservation(
-                self._config, board.busy_ms if is_executor else 0.0, spec.every
+            scheduling=(
+                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
             ),
             budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
             transfer=BusTimes(

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
+from rack.backplane.words import Scheduler
 from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
@@ -78,13 +79,17 @@ LONGEST_EVERY = 1_000_000
 """Longest cycle of a board in ticks."""
 
 
+SchedulerName = Literal["fixed-priority", "earliest-deadline-first", "maximum-urgency-first"]
+
+
 class ClockConfig(Table):
     """`[clock]`: system clock and its board, the system controller in slot 1."""
 
-    scheduler: Literal["fixed-priority", "earliest-deadline-first"] = "fixed-priority"
-    """fixed-priority: SCHED_FIFO with the boards' priorities; earliest-deadline-first: in real time
-    SCHED_DEADLINE by the boards' cycles, with twice their budgets reserved; on any core if the
-    kernel refuses a board's own"""
+    scheduler: SchedulerName | None = None
+    """how boards compete for their cores; fixed-priority, the default: SCHED_FIFO with the boards'
+    priorities; earliest-deadline-first: SCHED_DEADLINE by the boards' cycles, with twice their
+    budgets reserved; maximum-urgency-first: critical boards precede others, then the least laxity
+    counts (lockstep only); if a config names one, an operator may change it while the rack runs"""
     on_no_realtime: Literal["refuse", "warn"] = "warn"
     """whether to warn or to refuse the launch if the system refuses a SCHED_FIFO priority"""
     period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
@@ -116,6 +121,10 @@ class TimingConfig(Table):
     R_s / n"""
     clock_ms: Milliseconds = 0.0
     """processor time that the system clock's board needs per tick [ms]"""
+    lockstep_load: float = Field(0.0, ge=0, le=1000)
+    """in lockstep, computing time of each cycle as a multiple of its budget, on simulated cores
+    under the boards' schedulers, which the config must name; 0: computing takes no simulated
+    time"""
     small_share: float = Field(0.1, gt=0, le=1)
     """largest fraction of a cycle that counts as much smaller than the cycle (eq. 3.10)"""
 
@@ -252,6 +261,11 @@ class BoardConfig(PlacedConfig):
     """when the executor reads a port, by port; the ages of all its messages are recorded"""
     params: dict[str, Any] = {}
     """parameters of the level, declared by its class"""
+    scheduler: SchedulerName | None = None
+    """how the executor competes for its core; default: clock.scheduler; on one core,
+    maximum-urgency-first precedes earliest-deadline-first, and this fixed-priority"""
+    critical: bool = False
+    """maximum-urgency-first runs critical boards before others"""
     transfer: TransferConfig = TransferConfig()
     """emulation of a slower bus for this board"""
     ends_run: bool = False
@@ -344,6 +358,7 @@ class CommandConfig(Table):
         "table",
         "do",
         "set",
+        "schedule",
         "enable",
         "disable",
         "reset",
@@ -351,8 +366,9 @@ class CommandConfig(Table):
     ]
     """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
     add or remove a control modification; table: switch to another state table; do: carry out one of
-    the level's own commands; set: change a live parameter of the level; enable, disable: turn the
-    torque of the arm on or off; reset: clear a fault of its drives; release: end robot.bring_up"""
+    the level's own commands; set: change a live parameter of the level; schedule: change the
+    scheduler of its board; enable, disable: turn the torque of the arm on or off; reset: clear a
+    fault of its drives; release: end robot.bring_up"""
     tick: Tick | None = None
     """tick at which the command is issued; give at most one of tick, at"""
     at: Moment | None = None
@@ -369,7 +385,7 @@ class CommandConfig(Table):
     """goal: the arm's start position"""
     name: Annotated[str, StringConstraints(max_length=MAX_NAME_BYTES)] | None = None
     """name of a control modification or of a state table; command to carry out, as in pick block1;
-    parameter to set, as in bandwidth=80"""
+    parameter to set, as in bandwidth=80; scheduler"""
     on: bool | None = None
     """whether to add (true) or to remove (false) the control modification"""
 
@@ -477,6 +493,22 @@ class RackConfig(Table):
     def format_notes(self) -> list[str]:
         """Notes on changes since this config's format. Empty if the format is the newest."""
         return [FORMAT_NOTE] if self.format < FORMAT else []
+
+    @property
+    def names_schedulers(self) -> bool:
+        """Whether the config names a scheduler, so that an operator may change it."""
+        return bool(self.clock.scheduler) or any(board.scheduler for board in self.board.values())
+
+    @property
+    def valid_schedulers(self) -> tuple[str, ...]:
+        """Names of the schedulers that boards may have in this clock mode."""
+        # Linux has no scheduler by urgency.
+        return get_args(SchedulerName)[: 3 if self.is_lockstep else 2]
+
+    def find_scheduler(self, board: str) -> Scheduler:
+        """Return the scheduler of a board's executor at the launch."""
+        word = self.board[board].scheduler or self.clock.scheduler or "fixed-priority"
+        return Scheduler.find(word)
 
     @property
     def is_lockstep(self) -> bool:

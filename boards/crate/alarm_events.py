@@ -16,7 +16,7 @@ from rack.backplane.message import escape_text
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, open_alarm_ring
-from rack.backplane.words import Demand
+from rack.backplane.words import Demand, Scheduler
 from rack.boards.config.cell import find_geom_name
 from rack.boards.config.loader import read_stored
 from rack.boards.config.published import PublishedRack
@@ -60,6 +60,7 @@ EVENT_KINDS: Mapping[Alarm, EventKind] = {
     Alarm.INBOX_FULL: "held",
     Alarm.COMMANDED: "command",
     Alarm.OPERATOR_GONE: "command",
+    Alarm.SCHEDULER_KEPT: "command",
     Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
@@ -71,6 +72,7 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
         Alarm.LATE: "'{subject}' missed its deadline: still running at its next release",
         Alarm.PLAN_LATE: "'{subject}' missed its deadline: its plan was not finished",
         Alarm.STARVED: "'{subject}' is not getting its core: {releases} missed since tick {since}",
+        Alarm.SCHEDULER_KEPT: "'{subject}' goes on as before: {scheduler} refused: {what}",
     },
     "mailbox": {
         Alarm.FLOWS: "'{subject}': messages flow again, {span} after a fault",
@@ -246,8 +248,11 @@ class AlarmReader:
             words["what"] = escape_text(f"{code}: {measured}, {detail}")
         else:
             subject = self._name_subject(about, number, owner)
-            board = subject if alarm == Alarm.REJOINED else owner
-            if about == "mailbox":
+            board = subject if alarm in (Alarm.REJOINED, Alarm.SCHEDULER_KEPT) else owner
+            if alarm == Alarm.SCHEDULER_KEPT:
+                words["scheduler"] = to_enum(Scheduler, value).word
+                words["what"] = escape_text(bytes(row["text"]).decode("utf-8", "replace"))
+            elif about == "mailbox":
                 words["writer"] = self._layout.mailboxes[number].writer
             elif about == "geom":
                 words["writer"] = self._geom(to_integer(value))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 
-from rack.backplane.process import DEADLINE, keep_cores_awake, read_memory_sizes
+from rack.backplane.process import (
+    DEADLINE,
+    keep_cores_awake,
+    read_memory_sizes,
+    reserve_time,
+)
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block
+from rack.backplane.words import Block, Scheduler
 from rack.boards.config.layout import list_replaced_cores
 from rack.boards.config.resolved import Resolved
 from rack.boards.config.rules import load_network_rules
@@ -20,6 +24,7 @@ _PERMIT = (
 )
 PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
 """Advice on obtaining real-time priorities."""
+EARLIEST = Scheduler.EARLIEST_DEADLINE_FIRST
 FILES = 32
 """Files that a process of a rack may open, in addition to one for each process and mailbox."""
 
@@ -35,7 +40,20 @@ def check_open_files(plan: Resolved) -> None:
 
 
 def check_realtime(plan: Resolved, segment: Segment) -> None:
-    """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
+    """Raise `LaunchError` if a scheduler was refused, or a priority that the config requires."""
+    for task in plan.tasks:
+        if (scheduling := task.scheduling) is None or scheduling.reservation is None:
+            continue
+        block = segment.get_block(task.task)
+        if block[Block.SCHEDULER] != EARLIEST or block[Block.PRIORITY] == DEADLINE:
+            continue
+        # The board was refused. Ask once more for the reason.
+        if why := reserve_time(scheduling.reservation, block[Block.PID]):
+            raise LaunchError(
+                f"board.{task.task}.scheduler: {EARLIEST.word} refused: {why}; otherwise use"
+                " fixed-priority",
+                2,
+            )
     if plan.config.clock.on_no_realtime == "refuse" and (refusal := _find_refusal(plan, segment)):
         raise LaunchError(f'{refusal}, and clock.on_no_realtime is "refuse". {PERMIT}')
 
@@ -56,7 +74,11 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
         return
     if refusal := _find_refusal(plan, segment):
         yield f"{refusal}; missed deadlines are likely. {PERMIT}"
-    yield from _list_reservations(plan, segment)
+    reserved = [
+        task.task for task in plan.tasks if segment.get_block(task.task)[Block.PRIORITY] == DEADLINE
+    ]
+    if reserved:
+        yield f"earliest deadline first by SCHED_DEADLINE: {', '.join(sorted(reserved))}"
     unlocked = {}
     for task in plan.layout.tasks:
         mapped, locked = read_memory_sizes(segment.get_block(task.name)[Block.PID])
@@ -87,24 +109,3 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
     if not refused or plan.config.is_lockstep:
         return ""
     return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}"
-
-
-def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield a clause for each outcome of reserving processor time, with the tasks that it concerns.
-
-    The reservation was made on the task's core, on any core, or refused.
-    """
-    blocks = {
-        task.task: segment.get_block(task.task)
-        for task in plan.tasks
-        if task.reservation is not None
-    }
-    reserved = {name for name, block in blocks.items() if block[Block.PRIORITY] == DEADLINE}
-    pinned = {name for name in reserved if len(os.sched_getaffinity(blocks[name][Block.PID])) == 1}
-    for outcome, names in (
-        ("earliest deadline first by SCHED_DEADLINE, on their cores", pinned),
-        ("earliest deadline first by SCHED_DEADLINE, on any core", reserved - pinned),
-        ("SCHED_DEADLINE refused, fixed priorities", blocks.keys() - reserved),
-    ):
-        if names:
-            yield f"{outcome}: {', '.join(sorted(names))}"

@@ -23,7 +23,7 @@ from rack.backplane.process import (
     take_core,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, System, TaskState
+from rack.backplane.words import Block, Scheduler, System, TaskState
 from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
@@ -140,10 +140,9 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             # Touch memory while the process still has ordinary priority, because a restarted board
             # must not delay another board's cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
+        _take_scheduled_core(segment, wiring)
         disable_timer_slack()
         hold_memory(lockstep)
-        block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open_connections()
         task = (
@@ -161,6 +160,22 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         # Return to ordinary priority, because closing files must not delay another board's cycle.
         set_priority(0)
         level.close()
+
+
+def _take_scheduled_core(segment: Segment, wiring: TaskWiring) -> None:
+    """Pin the calling process to the core of its task, and give it the task's scheduler.
+
+    After a restart this is the scheduler that the previous process had.
+    """
+    spec = segment.layout.find_task(wiring.task)
+    block = segment.get_block(wiring.task)
+    reservation = None
+    if wiring.scheduling is not None:
+        block[Block.SCHEDULER] = block[Block.SCHEDULER] or wiring.scheduling.scheduler
+        if block[Block.SCHEDULER] == Scheduler.EARLIEST_DEADLINE_FIRST:
+            reservation = wiring.scheduling.reservation
+    block[Block.PRIORITY] = take_core(spec.core, spec.priority, reservation)
+    block[Block.CORE] = spec.core
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:

@@ -9,6 +9,7 @@ cycles.
 
 from __future__ import annotations
 
+from importlib import import_module
 from time import monotonic_ns
 
 from rack.backplane.process import set_priority
@@ -22,6 +23,7 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ArmState
 
+SIMULATED_CORES = "rack.boards.run.simulated_cores"
 _DEMANDS = tuple(Demand)
 
 
@@ -69,6 +71,10 @@ class VirtualControlLoop(Task):
             self.serve, slow_access(reads, times.read_ns), settings
         )
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
+        if wiring.scheduling is not None and wiring.scheduling.cost_ns:
+            # Import it only in racks that need it.
+            step = import_module(SIMULATED_CORES).CoreStep(self, wiring.scheduling.cost_ns)
+            self.simulated.steps.append(step)
 
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""
@@ -96,10 +102,13 @@ class VirtualControlLoop(Task):
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
 
-        If releases were skipped before the cycle, or if it is the first, also record this tick as
-        the beginning of regular reads.
+        Tell the level if it has missed a deadline. If releases were skipped before the cycle, or if
+        it is the first, also record this tick as the beginning of regular reads.
         """
-        if self.next_cycle.skipped or not self._has_cycled:
+        skipped = self.next_cycle.skipped
+        if self._has_cycled and (skipped or self.stopwatch.has_missed):
+            self.executor.handle_missed_deadline(tick, skipped)
+        if skipped or not self._has_cycled:
             self.inputs.task.since = tick
             self._has_cycled = True
         if self._guard is not None:

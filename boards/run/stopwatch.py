@@ -31,8 +31,9 @@ class Stopwatch:
     `finish_cycle` or `finish_idle_cycle`.
 
     Attributes:
-        is_late: True if the cycle began more than half a tick late or after skipped releases, or
-            if it is the first.
+        is_late: True if the cycle began more than half a tick late or after skipped releases, if
+            the cycle before it missed its deadline, or if it is the first.
+        has_missed: True if the last cycle has missed its deadline.
         late_ns: In lockstep, simulated lateness of the clock for the cycle.
         start_ns: Start of the cycle. All times are on CLOCK_MONOTONIC.
         plan_ns: End of the plan's transfer over the bus (C of fig. 4).
@@ -71,6 +72,7 @@ class Stopwatch:
         self._late_ns = self._period_ns // 2
         self._release_ns = 0  # grid point of the tick, in lockstep the start without `late_ns`
         self.is_late = True
+        self.has_missed = False
         self.late_ns = 0
         self.start_ns = self.plan_ns = self.read_ns = self.process_ns = self.end_ns = 0
 
@@ -88,7 +90,12 @@ class Stopwatch:
         else:
             release_ns -= self.late_ns
         self._release_ns = release_ns
-        self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
+        self.is_late = (
+            skipped > 0
+            or start_ns - release_ns > self._late_ns
+            or self.has_missed
+            or not self._closed_ns
+        )
 
     def find_late_tick(self, deadline: int) -> int | None:
         """Return the current tick if it is `deadline` or later, otherwise None.
@@ -116,7 +123,7 @@ class Stopwatch:
         tick = self._tick
         skipped = self._skipped
         lockstep_done = self._lockstep_done
-        is_missed = not in_time or (
+        self.has_missed = is_missed = not in_time or (
             lockstep_done is None and self.end_ns > self._compute_time_ns(deadline)
         )
         if self._reading.troubles != self._troubles or not in_time:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import sys
 import time
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import to_enum
@@ -28,12 +30,18 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System, is_switched_on
 from rack.boards.faults.clock_board import FaultStage
-from rack.boards.operator import build_hold_command
+from rack.boards.operator import build_hold_command, find_level
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import ClockWiring
-from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
+from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer, Operation
 
+if TYPE_CHECKING:
+    from rack.boards.run.scheduling import SchedulerChanges
+    from rack.boards.run.simulated_cores import SimulatedCores
+
+SCHEDULING = "rack.boards.run.scheduling"
+SIMULATED_CORES = "rack.boards.run.simulated_cores"
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
 OPERATOR_TIMEOUT_NS = 1_000_000_000
@@ -47,6 +55,9 @@ class SystemController:
     """Work of the clock's board at every tick, apart from releasing tasks.
 
     Implements `rack.backplane.clock.driver.Controller`.
+
+    Attributes:
+        cores: Simulated cores, in lockstep if computing takes simulated time.
     """
 
     def __init__(
@@ -58,8 +69,14 @@ class SystemController:
         self._driver = driver
         self._faults = FaultStage(segment, driver)
         self._desk = OperatorCommandIssuer(segment, driver.alarms)
+        if wiring.schedulings:
+            # Import it only in racks that name a scheduler.
+            self._desk.changes = import_module(SCHEDULING).SchedulerChanges(
+                segment, driver.tasks, wiring.schedulings, driver.alarms
+            )
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
+        self.cores: SimulatedCores | None = None
 
     def begin_tick(self, tick: int) -> None:
         """Do the work that is due before the tasks of `tick` are released."""
@@ -81,6 +98,8 @@ class SystemController:
     def finish_release(self, tick: int) -> None:
         """Do the work that is due after the tasks of `tick` have been released."""
         self._faults.act_within_tick(tick)
+        if self.cores is not None:
+            self.cores.run_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:
         """Return the first tick after `tick` at which `begin_tick` has work or the run may end."""
@@ -159,11 +178,14 @@ class OperatorCommandIssuer:
     Attributes:
         requested: Number of requests that the operator table had when it was last read.
         next_tick: First tick with work to do, unless there are new requests.
+        changes: Changes of schedulers. None if the rack names no scheduler.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
         self._words = segment.words
         self._alarms = alarms
+        self.changes: SchedulerChanges | None = None
+        self._layout = segment.layout
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
         self._boxes = segment.layout.mailboxes
@@ -221,6 +243,9 @@ class OperatorCommandIssuer:
         message.raw[:] = entry.message[: len(message.raw)]
         message.id = entry.serial
         writer.write(tick, self._clock.compute_tick())
+        if message.what == Operation.SCHEDULE and self.changes is not None:
+            board = find_level(entry, self._layout)
+            self.changes.change_scheduler(board, message.name, tick)
         entry.stage = RequestStage.GIVEN
         if message.what not in (*SETTINGS, *DRIVE_OPERATIONS):
             self._newest[entry.mailbox] = message.id
@@ -359,5 +384,10 @@ def run_clock(
             driver.snapshot = ClockCopies(segment, driver, copier)
     else:
         driver = RealtimeDriver(segment, end_of_run, alarms)
-    driver.controller = SystemController(segment, wiring, driver, end_of_run)
+    driver.controller = controller = SystemController(segment, wiring, driver, end_of_run)
+    if isinstance(driver, LockstepDriver) and any(s.cost_ns for s in wiring.schedulings.values()):
+        driver.permits_batches = False
+        controller.cores = import_module(SIMULATED_CORES).SimulatedCores(
+            wiring.schedulings, driver, segment.layout.clock_ns
+        )
     driver.run()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
@@ -115,7 +116,8 @@ def simulate_schedule(
         for task in tasks
     ]
     for core in {task.core for task in tasks}:
-        _simulate_core([runner for runner in runners if runner.task.core == core], until_ns)
+        for _ in simulate_core([r for r in runners if r.task.core == core], 0, until_ns):
+            pass
     spans = sorted(
         (s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core)
     )
@@ -126,17 +128,50 @@ def simulate_schedule(
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
 
 
-def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
-    """Simulate the tasks of one core. At each release and end of a part, choose the task to run."""
-    now = 0
+Urgency = tuple[Any, ...]
+"""Key of a ready task. The task with the smallest key runs."""
+
+
+class CoreTask(Protocol):
+    """A task or job that competes for a core."""
+
+    @property
+    def ready_at(self) -> int:
+        """Time in ns from which it can run."""
+
+    def get_urgency(self, now_ns: int) -> Urgency:
+        """Return its urgency at a time."""
+
+    def run_step(self, now_ns: int, until_ns: int) -> int:
+        """Run it until a part of it or the time is over, and return the end in ns."""
+
+
+AnyCoreTask = TypeVar("AnyCoreTask", bound=CoreTask)
+
+
+def simulate_core(
+    tasks: Sequence[AnyCoreTask], start_ns: int, until_ns: int
+) -> Iterator[tuple[int, AnyCoreTask]]:
+    """Simulate one core. At each release and end of a part, choose the task to run.
+
+    Args:
+        tasks: The tasks of the core.
+        start_ns: Start of the simulation.
+        until_ns: End of the simulation.
+
+    Yields:
+        The end of each step in ns, and the task that ran.
+    """
+    now = start_ns
     while now < until_ns:
-        ready = [runner for runner in runners if runner.ready_at <= now]
-        next_release = min((r.ready_at for r in runners if r.ready_at > now), default=until_ns)
+        ready = [task for task in tasks if task.ready_at <= now]
+        next_release = min((t.ready_at for t in tasks if t.ready_at > now), default=until_ns)
         if not ready:
             now = next_release
             continue
-        first = min(ready, key=_TaskSimulation.get_sort_key)
+        first = min(ready, key=lambda task: task.get_urgency(now))
         now = first.run_step(now, min(next_release, until_ns))
+        yield now, first
 
 
 class _TaskSimulation:
@@ -164,7 +199,7 @@ class _TaskSimulation:
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
-    def get_sort_key(self) -> tuple[int, bool, int, str]:
+    def get_urgency(self, now_ns: int) -> Urgency:
         """Return the key by which ready tasks are sorted. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority

@@ -36,7 +36,7 @@ def command(
     goal: list[str] | None = argument(
         "GOAL",
         "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for"
-        " modify: NAME on|off; for table: NAME; for do: the level's command; for set:"
+        " modify: NAME on|off; for table, schedule: NAME; for do: the level's command; for set:"
         " KEY=VALUE",
         None,
     ),
@@ -69,6 +69,7 @@ def command(
     table     switch to another state table
     do        give the level one of its own commands, in place of the level above
     set       set a live parameter of the level, as 'rack set' does
+    schedule  change the scheduler of the level's board, if the config names one
     enable    ask the arm's drives for torque; the arm continues from its position
     disable   brake the arm, and take the torque from its drives
     reset     clear a fault of the arm's drives, which are then disabled
@@ -96,6 +97,7 @@ def command(
       rack command hardware servo enable --wait
       rack command brown modifications modify wrist.deadzone on --at 2.5
       rack command nist-state-table task table careful
+      rack command chimera trajectory schedule earliest-deadline-first
       rack command nist-state-table elemental_move do pick block1 --wait
     """
     from rack.backplane.segment import Segment

@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rack.backplane.operator_table import (
@@ -16,7 +17,7 @@ from rack.backplane.operator_table import (
     RequestStage,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
+from rack.backplane.words import Block, Scheduler, System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import build_request, describe_commands, parse_command
 from rack.boards.config.published import PublishedRack
@@ -106,6 +107,8 @@ class LevelCommander:
         # On any exit from the context, a request that has not been given is withdrawn.
         with OperatorTable(segment).claim_request(clock_request) as entry:
             reply = self._await_given(entry, command.level)
+        if command.operation is Operation.SCHEDULE:
+            return self._check_scheduler(reply, command.name or "")
         return self._await_reply(reply, wait, timeout_s)
 
     def lease_command(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
@@ -222,6 +225,16 @@ class LevelCommander:
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
         return reply
 
+    def _check_scheduler(self, reply: Reply, word: str) -> Reply:
+        """Return the reply of the clock, which has changed the scheduler of a board or not."""
+        now = Scheduler(self._segment.get_block(reply.level)[Block.SCHEDULER]).word
+        reply = replace(reply, fate="done", taken_up=reply.given, done=reply.given)
+        if now == word:
+            return reply
+        return replace(
+            reply, fate="refused", objection=f"still {now}; see the event for the reason"
+        )
+
     def _poll_run(self, about: str, awaited: str) -> Iterator[bool]:
         """Check the rack repeatedly, and yield each time whether the run is over.
 
@@ -273,7 +286,7 @@ def parse_goal(what: str, words: Sequence[str]) -> Document:
                 f"'modify {' '.join(words)}': must be 'modify NAME on' or 'modify NAME off'", 2
             )
         return {"name": words[0], "on": words[1] == "on"}
-    if what in ("table", "do", "set"):
+    if what in ("table", "do", "set", "schedule"):
         return {"name": " ".join(words)}
     goal: Document = {}
     for word in words:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.text import Text
 
-from rack.backplane.process import DEADLINE
 from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
 from rack.tools.console.answer import print_text
@@ -27,11 +26,13 @@ from rack.tools.monitor.snapshot import DEAD, LOST, Snapshot, TaskRow
 if TYPE_CHECKING:
     from rich.live import Live
 
-SCHEDULING = {DEADLINE: "deadline", 0: "other"}
+SCHEDULING = {"earliest-deadline-first": "deadline", "maximum-urgency-first": "urgency"}
 
 COLUMNS: dict[str, Callable[[TaskRow], Any]] = {
     **{name: attrgetter(name) for name in ("slot", "task", "core")},
-    "sched": lambda row: SCHEDULING.get(row.priority, f"FIFO {row.priority}"),
+    "sched": lambda row: SCHEDULING.get(
+        row.scheduler, f"FIFO {row.priority}" if row.priority else "other"
+    ),
     "Hz": lambda row: f"{row.rate_hz:g}",
     **{name: attrgetter(name) for name in ("tick", "cycles", "missed", "skipped", "restarts")},
     "exec ms": lambda row: format_decimal(row.exec_ms, 2),

@@ -15,7 +15,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.message import AnyMessage, format_state, get_reason
 from rack.backplane.segment import Segment
 from rack.backplane.trace import open_trace_ring
-from rack.backplane.words import Block, Demand, Run, System, TaskState
+from rack.backplane.words import Block, Demand, Run, Scheduler, System, TaskState
 from rack.boards.exchange import EXCHANGE_PORT, PortAge, list_port_ages
 from rack.boards.timing.trace_times import compute_execution_ns, compute_lateness_ns
 from rack.tools.monitor.holds import Hold, find_holds
@@ -54,6 +54,7 @@ class TaskRow:
 
     Attributes:
         priority: SCHED_FIFO priority obtained. 0 for ordinary scheduling.
+        scheduler: Its scheduler, as in a config.
         exec_ms: Longest execution time of the cycles that `RackMonitor` covers. None without a
             cycle.
         lateness_ms: Longest lateness of these cycles.
@@ -79,6 +80,7 @@ class TaskRow:
     reason: str
     row: str
     mode: str
+    scheduler: str
 
 
 @dataclass(frozen=True)
@@ -267,6 +269,7 @@ class RackMonitor:
             reason=reason,
             row=row,
             mode=mode,
+            scheduler=to_enum(Scheduler, block[Block.SCHEDULER] or 1).word,
         )
 
     def forget_times(self) -> None:

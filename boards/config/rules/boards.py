@@ -11,6 +11,7 @@ from itertools import pairwise
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.system_clock import format_rate
 from rack.backplane.errors import ClockError
+from rack.backplane.words import Scheduler
 from rack.boards.config.connections import Wiring
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import report_repeated_names
@@ -21,7 +22,7 @@ from rack.boards.config.schema import (
     BoardConfig,
     ScheduleConfig,
 )
-from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
+from rack.boards.config.timing import PLANNER_BUDGET, compute_frames, list_reservation_mistakes
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
@@ -231,25 +232,32 @@ def check_polling(wiring: Wiring) -> Mistakes:
             yield Mistake(f"board.{name}.wake", "poll", why)
 
 
-def check_reservations(wiring: Wiring) -> Mistakes:
-    """With earliest deadline first, check that each board can reserve its processor time."""
+def check_schedulers(wiring: Wiring) -> Mistakes:
+    """Check that each board can have its scheduler, and can take simulated time if it has to."""
     config = wiring.config
-    if config.clock.scheduler == "fixed-priority":
-        return
-    if not config.timing.clock_ms:
-        yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice this time")
+    reported = set[str]()
+    load = config.timing.lockstep_load if config.is_lockstep else 0.0
+    if load and not config.names_schedulers:
+        yield Mistake("timing.lockstep_load", load, "needs clock.scheduler, which is missing")
     for name, board in config.board.items():
-        place = f"board.{name}"
-        if not board.busy_ms:
-            yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
-        if (board.wake or config.clock.wake) == "poll":
-            yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
-        if board.coupling == "tight":
-            why = "a planner with the executor's priority would run below all reservations"
-            yield Mistake(f"{place}.coupling", "tight", why)
-        if board.executor == LAN_ADAPTER:
-            why = "the network adapter's threads need its priority; use fixed-priority"
-            yield Mistake("clock.scheduler", config.clock.scheduler, why)
+        scheduler = config.find_scheduler(name)
+        key = "clock.scheduler" if board.scheduler is None else f"board.{name}.scheduler"
+        if scheduler.word not in config.valid_schedulers and key not in reported:
+            reported.add(key)
+            valid = " or ".join(config.valid_schedulers)
+            why = f"Linux has no such scheduler; in real time use {valid}"
+            yield Mistake(key, scheduler.word, why)
+        if scheduler is Scheduler.EARLIEST_DEADLINE_FIRST:
+            if not config.timing.clock_ms and "timing" not in reported:
+                reported.add("timing")
+                yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice this time")
+            yield from list_reservation_mistakes(config, name, key)
+        elif load and not board.busy_ms:
+            why = "missing; a cycle takes this time, times timing.lockstep_load"
+            yield Mistake(f"board.{name}.budget", None, why)
+        if load and board.planner is not None:
+            why = f"'{name}' has a planner, which would take no simulated time"
+            yield Mistake("timing.lockstep_load", load, why)
 
 
 def check_schedule(wiring: Wiring) -> Mistakes:

@@ -47,7 +47,8 @@ class TrajectoryExecutor(Executor):
 
     The arm rests at the last goal when the queue is empty. Queued requests are executed even if no
     board is above the level. While a board below is lost or stopped, or an operator holds the
-    level, the arm rests, and the current request resumes afterwards. A request that cannot be
+    level, the arm rests, and the current request resumes afterwards. With `after_missed = "hold"`
+    the same holds from a missed deadline to a RESUME or a CANCEL. A request that cannot be
     executed ends REFUSED, or FAILED if it had begun: the arm ramps to rest, all other accepted
     requests are CANCELLED, and new ones are REFUSED until a CANCEL [assumed]. After a restart the
     level continues with the requests in its own last messages.
@@ -90,6 +91,7 @@ class TrajectoryExecutor(Executor):
         self._stalled_s = params.stalled
         self._waiting_id = 0  # request whose waits are added up
         self._waited_s = 0.0
+        self._failure = ""  # why the arm has to rest after a missed deadline
         # Numbers of requests on which the last saved state depends.
         self._saved_ids: tuple[int, ...] = ()
 
@@ -98,6 +100,14 @@ class TrajectoryExecutor(Executor):
         # Take none before the requests of an earlier process are restored.
         return 0 if self._last_tick is None else self._agenda.remaining_capacity
 
+    def handle_missed_deadline(self, tick: int, skipped: int) -> None:
+        """Bring the arm to rest if the parameters demand it."""
+        if self.settings.after_missed == "hold" and not self._failure:
+            self._failure = (
+                f"deadline missed before tick {tick}: `resume` of {self.context.board} or cancel()"
+                " ends the hold"
+            )
+
     def process(self, tick: int) -> None:
         """Take requests, advance the motion, and write the set point that is due in two cycles."""
         if self._last_tick is None:
@@ -105,7 +115,8 @@ class TrajectoryExecutor(Executor):
             self._last_tick = tick - self.context.every
         cycles = (tick - self._last_tick) // self.context.every
         self._last_tick = tick
-        self._orders.take_commands(self.operator)
+        if self._orders.take_commands(self.operator):
+            self._failure = ""
         self._sight.update_model(self.world)
         cancelled = self._agenda.take_new_requests(self.requests)
         if cycles > HANDOVER_CYCLES and self._boards.in_step:
@@ -115,9 +126,10 @@ class TrajectoryExecutor(Executor):
             self._work.interrupt_motion()
         self._follow_boards()
         if cancelled:
+            self._failure = ""
             self._work.cancel_motion()
         self._check_guard(cycles)
-        hold = self._orders.is_holding
+        hold = self._orders.is_holding or bool(self._failure)
         # Catch up on the samples of missed cycles, so that the motion is not delayed. After more
         # than a few missed cycles the boards hold.
         for late_cycles in reversed(range(min(cycles, HANDOVER_CYCLES))):
@@ -242,6 +254,8 @@ class TrajectoryExecutor(Executor):
 
     def _find_wait_reason(self) -> str:
         """Return why the motion does not continue, or an empty string if it does."""
+        if self._failure:
+            return self._failure
         if not self._boards.in_step:
             return self._boards.wait_reason
         if self._orders.is_in_force:

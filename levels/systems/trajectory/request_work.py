@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import Field
 
@@ -42,6 +42,9 @@ class TrajectoryParams(Table):
     stalled: Positive = 90.0
     """time for which a request may wait in total until it fails; waits for an operator or for the
     end of a required stop do not count [s]"""
+    after_missed: Literal["continue", "hold"] = "continue"
+    """what follows a missed deadline of this level; hold: the arm comes to rest, until an operator
+    resumes the level or a program cancels its requests"""
 
 
 class MotionTools(NamedTuple):

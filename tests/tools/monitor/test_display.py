@@ -14,7 +14,26 @@ from rack.tools.monitor.display import COLUMNS, PlainDisplay, RackView, format_l
 from rack.tools.monitor.holds import Hold
 from rack.tools.monitor.snapshot import Snapshot, TaskProgress, TaskRow
 
-ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "", "", "")
+ROW = TaskRow(
+    "servo",
+    2,
+    1,
+    80,
+    400.0,
+    "executing",
+    1200,
+    1201,
+    0,
+    3,
+    4,
+    1,
+    0.25,
+    None,
+    "",
+    "",
+    "",
+    "fixed-priority",
+)
 PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, lateness_ms=1.5)
 MOVE = replace(PLANNER, task="elemental_move.planner", exec_ms=1027.97, lateness_ms=1969.67)
 TROUBLED = replace(ROW, reason="joint 'j2': too far")

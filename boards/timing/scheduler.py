@@ -1,0 +1,101 @@
+"""Preemptive schedulers of a core: fixed priority, earliest deadline first, maximum urgency first.
+
+Maximum urgency first is CHIMERA's: critical tasks precede others, then the least laxity counts (the
+time that a job can still wait before it misses its deadline), then the user's priority. D. B.
+Stewart and P. K. Khosla, *Real-Time Scheduling of Sensor-Based Control Systems*, IEEE Workshop on
+Real-Time Operating Systems and Software (1991).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rack.backplane.words import Scheduler
+from rack.boards.timing.schedule import Urgency, simulate_core
+
+
+def compute_urgency(
+    scheduler: Scheduler, priority: int, deadline_ns: int, laxity_ns: int, *, is_critical: bool
+) -> tuple[int, ...]:
+    """Return the urgency of a job under a scheduler, as a key of which the smallest runs first.
+
+    Args:
+        scheduler: Scheduler of the job's task.
+        priority: Fixed priority of the task.
+        deadline_ns: Deadline of the job.
+        laxity_ns: Time from the earliest possible end of the job to its deadline.
+        is_critical: Whether the task is critical.
+    """
+    match scheduler:
+        case Scheduler.FIXED_PRIORITY:
+            return -scheduler, -priority
+        case Scheduler.EARLIEST_DEADLINE_FIRST:
+            return -scheduler, deadline_ns, -priority
+        case Scheduler.MAXIMUM_URGENCY_FIRST:
+            return -scheduler, not is_critical, laxity_ns, -priority
+
+
+@dataclass
+class CoreJob:
+    """Job that competes for a simulated core.
+
+    Attributes:
+        task: Name of the task.
+        release: Its release, as a tick.
+        scheduler: Scheduler of the task.
+        priority: Fixed priority of the task.
+        is_critical: Whether the task is critical.
+        ready_at: Time in ns from which the job can run.
+        deadline_ns: Deadline of the job.
+        left_ns: Processor time that the job still needs. 0 when it has ended.
+    """
+
+    task: str
+    release: int
+    scheduler: Scheduler
+    priority: int
+    is_critical: bool
+    ready_at: int
+    deadline_ns: int
+    left_ns: int
+
+    def get_urgency(self, now_ns: int) -> Urgency:
+        """Return its urgency at a time. Of equal jobs, the one released first runs."""
+        laxity_ns = self.deadline_ns - now_ns - self.left_ns
+        urgency = compute_urgency(
+            self.scheduler,
+            self.priority,
+            self.deadline_ns,
+            laxity_ns,
+            is_critical=self.is_critical,
+        )
+        return *urgency, self.ready_at, self.task
+
+    def run_step(self, now_ns: int, until_ns: int) -> int:
+        """Run the job until it ends or the time is over, and return the end in ns."""
+        end = min(now_ns + self.left_ns, until_ns)
+        self.left_ns -= end - now_ns
+        return end
+
+
+class SimulatedCore:
+    """A core whose jobs become known while time advances.
+
+    Attributes:
+        jobs: Jobs that have not ended.
+        now_ns: Time up to which the core has been simulated.
+    """
+
+    def __init__(self, now_ns: int = 0) -> None:
+        self.jobs: list[CoreJob] = []
+        self.now_ns = now_ns
+
+    def run_until(self, until_ns: int) -> CoreJob | None:
+        """Simulate the core until a job ends, and return the job. None if no job ends in time."""
+        for now_ns, job in simulate_core(self.jobs, self.now_ns, until_ns):
+            if not job.left_ns:
+                self.now_ns = now_ns
+                self.jobs.remove(job)
+                return job
+        self.now_ns = until_ns
+        return None
