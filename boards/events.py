@@ -326,18 +326,17 @@ class Ending:
         is not listed. An arm has a latched fault if it has exceeded limits or had unintended
         contacts. It is not listed if the level that drives it is.
         """
-        reported = {
-            board: f"level '{board}': {get_reason(status) or f'error {status.error}'}"
-            for board, status in iterate_statuses(self._segment, "error")
-            if status.error and f"{board}.status" != self._ends_run
-        }
-        counted = {
+        faults = {
             board: f"arm of '{board}': limits exceeded in {state.violations} substeps,"
             f" {state.touches} unintended contacts"
             for board, state in iterate_arm_states(self._segment)
             if state.violations or state.touches
         }
-        return [*(counted | reported).values()]
+        for board, status in iterate_statuses(self._segment, "error"):
+            if status.error and f"{board}.status" != self._ends_run:
+                why = get_reason(status) or f"error {status.error}"
+                faults[board] = f"level '{board}': {why}"
+        return [*faults.values()]
 
     def find_long_holds(
         self, events: Sequence[Event], brakings: Sequence[Braking], ran_ms: float
@@ -364,34 +363,28 @@ class Ending:
             return
         tick_ms = segment.layout.clock_ns * 1e-6
         hands = dict(iterate_statuses(segment, "tension"))
-        braked = {
-            name: message
-            for name, message in (
-                *iterate_arm_states(segment),
-                *iterate_statuses(segment, "braked"),
-            )
-            if message.braked and name not in hands and not brakings
-        }
-        unreleased = []
-        for name, message in braked.items():
-            since = segment.get_block(name)[Block.LEVEL_SINCE]
-            why = get_reason(message) or NO_TORQUE
-            unreleased.append(Braking(why, since, ran_ms - since * tick_ms))
-        held = []
+        arms = dict((*iterate_arm_states(segment), *iterate_statuses(segment, "braked")))
+        counted = [braking for braking in brakings if braking.why != DEMANDED]
+        for name, message in () if brakings else arms.items():
+            # The brakes have been engaged since the start.
+            if message.braked and name not in hands:
+                since = segment.get_block(name)[Block.LEVEL_SINCE]
+                why = get_reason(message) or NO_TORQUE
+                counted.append(Braking(why, since, ran_ms - since * tick_ms))
+        times = [braking.lasted_ms for braking in counted]
+        if max(times, default=0.0) > MAX_HOLD_MS or sum(times) > MAX_BRAKED_FRACTION * ran_ms:
+            yield f"held without a known cause, in {ran_ms:g} ms: {format_brakings(counted)}"
+            return
+        if any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
+            return
         for name, status in iterate_statuses(segment, "state"):
             block = segment.get_block(name)
             lasted_ms = ran_ms - block[Block.LEVEL_SINCE] * tick_ms
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > MAX_HOLD_MS:
-                held.append(
+                yield (
                     f"level '{name}' held for {lasted_ms:g} ms without a known cause:"
                     f" {get_reason(status) or 'no reason given'}"
                 )
-        counted = [braking for braking in brakings if braking.why != DEMANDED] or unreleased
-        times = [braking.lasted_ms for braking in counted]
-        if max(times, default=0.0) > MAX_HOLD_MS or sum(times) > MAX_BRAKED_FRACTION * ran_ms:
-            yield f"held without a known cause, in {ran_ms:g} ms: {format_brakings(counted)}"
-        elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
-            yield from held
 
     def find_object_ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
         """Compare the last sensed position of each object that has a goal with its goal.

@@ -71,13 +71,13 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
         A dictionary from input to age and arrival. The key is the port, or "<port>_<board>" for a
             port with several mailboxes.
     """
-    names = exchange.record.dtype.names or ()
+    names = (exchange.record.dtype.names or ())[::2]
     values = iter(exchange.raw.cast("q"))
-    labels = [name.removesuffix(f"_{AGE_SUFFIX}") for name in names[::2]]
-    ports = {
-        label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
+    return {
+        name.removesuffix(f"_{AGE_SUFFIX}"): PortAge(age, taken)
+        for name, age, taken in zip(names, values, values, strict=True)
+        if taken != NEVER
     }
-    return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
 class InputMailbox(NamedTuple):

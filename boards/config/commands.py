@@ -15,6 +15,7 @@ from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.operator_table import Request
 from rack.backplane.words import Scheduler
 from rack.boards.config.cell import build_rack_cell
+from rack.boards.config.connections import find_executors
 from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schema import CommandConfig, RackConfig
@@ -158,7 +159,7 @@ def _check_command(
         return
     yield from _check_goal(at, command, known)
     if command.operation is Operation.SET:
-        yield from _check_setting(place, command, level)
+        yield from _check_setting(place, command, level, config)
     elif command.operation is Operation.SCHEDULE:
         yield from _check_scheduler(at("name"), command, config)
     else:
@@ -226,25 +227,30 @@ def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mi
         )
 
 
-def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that a command `set` names a live parameter of its level and a valid value."""
+def _check_setting(
+    place: str, command: CommandConfig, level: PublishedLevel, config: RackConfig
+) -> Mistakes:
+    """Check that a command `set` names a live parameter of its level.
+
+    The value is checked only in a config, because the level's class is needed for it. A running
+    level checks the value of a live command itself.
+    """
     name = format_place(place, "name")
     try:
         key, value = read_setting(command.name or "")
     except LevelError as error:
         yield Mistake(name, command.name, str(error))
         return
-    params = name if place else f"board.{command.level}.params"
-    if not level.live or (key in level.keys and key not in level.live):
-        why = f"it is read at the launch only; live parameters: {', '.join(level.live) or 'none'}"
+    if key not in level.live:
+        params = name if place else f"board.{command.level}.params"
+        why = f"not a live parameter; live parameters: {', '.join(level.live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
-        return
-    table = level.params_model
-    setting = {key: value}
-    try:
-        table.model_validate(setting)
-    except ValidationError as error:
-        yield from convert_errors(error, table, setting, params)
+    elif place and (kind := find_executors(config)[command.level].params) is not None:
+        table = {**config.board[command.level].params, key: value}
+        try:
+            kind.model_validate(table)
+        except ValidationError as error:
+            yield from convert_errors(error, kind, table, name)
 
 
 def _check_scheduler(place: str, command: CommandConfig, config: RackConfig) -> Mistakes:
@@ -262,11 +268,8 @@ def _check_joints(place: str, joints: tuple[float, ...], config: RackConfig) -> 
     if robot is None:
         yield Mistake(place, list(joints), "the rack has no arm")
         return
-    if len(joints) != len(robot.joints):
-        why = (
-            f"{len(joints)} values; must be {len(robot.joints)}, one per joint:"
-            f" {', '.join(robot.joints)}"
-        )
+    if (count := len(robot.joints)) != len(joints):
+        why = f"{len(joints)} values; must be {count}, one per joint: {', '.join(robot.joints)}"
         yield Mistake(place, list(joints), why)
         return
     try:
@@ -276,6 +279,5 @@ def _check_joints(place: str, joints: tuple[float, ...], config: RackConfig) -> 
         return
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
-            yield Mistake(
-                place, value, f"out of range; joint '{name}' must be {low:g} to {high:g} rad"
-            )
+            why = f"out of range; joint '{name}' must be {low:g} to {high:g} rad"
+            yield Mistake(place, value, why)

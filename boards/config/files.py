@@ -118,19 +118,16 @@ def append_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tab
     folders = [FAULTS] if folder == CONFIGS else [folder, FAULTS]
     path = _locate_config(name_or_path, "--faults", *folders)
     script = _read_tables(path)
-    mistakes = [
-        Mistake(
-            f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else"
-        )
+    why = "a fault script contains [[fault]] tables and nothing else"
+    if mistakes := [
+        Mistake(f"{path.name}: {key}", None, why)
         for key, value in script.items()
         if key != "fault" or not isinstance(value, list)
-    ]
-    if mistakes:
+    ]:
         raise ConfigError(mistakes)
     faults = tables.get("fault")
-    if not isinstance(faults, list):
-        faults = []
-    return {**tables, "fault": [*faults, *script.get("fault", [])]}
+    own = faults if isinstance(faults, list) else []
+    return {**tables, "fault": [*own, *script.get("fault", [])]}
 
 
 def name_config(path: str) -> str:
@@ -185,17 +182,20 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
         """Return the absolute path of the file to which `text` refers, whether it exists or not."""
         return str(_find_referenced_file(text, folder) or folder / text)
 
-    tables = change_texts(tables, ("robot", "model"), find)
-    tables = change_texts(tables, ("python_path",), lambda text: str((folder / text).resolve()))
-    tables = change_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
-    for key in ("launch", "partners"):
-        tables = change_texts(
-            tables,
-            ("adapter", ANY, key),
-            lambda text: str(_find_referenced_file(text, folder) or text),
-        )
-    anchored: Tables = change_texts(tables, STATE_TABLES, find)
-    return anchored
+    def find_config(text: str) -> str:
+        """Return the absolute path of a config, or `text` itself if there is no such file."""
+        return str(_find_referenced_file(text, folder) or text)
+
+    for keys, change in (
+        (("robot", "model"), find),
+        (("python_path",), lambda text: str((folder / text).resolve())),
+        (("adapter", ANY, "certificates"), lambda text: str(folder / text)),
+        (("adapter", ANY, "launch"), find_config),
+        (("adapter", ANY, "partners"), find_config),
+        (STATE_TABLES, find),
+    ):
+        tables = change_texts(tables, keys, change)
+    return tables
 
 
 def change_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:

@@ -120,9 +120,7 @@ def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[t
     Invalid entries are left out, because their mistakes are already reported.
     """
     entries = tables.get(key)
-    if not isinstance(entries, list):
-        return
-    for at, entry in enumerate(entries):
+    for at, entry in enumerate(entries if isinstance(entries, list) else ()):
         with suppress(ValidationError):
             yield f"{key}[{at}]", kind.model_validate(entry)
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import isfinite
-from typing import Any, Literal, get_args
+from typing import Any
 
-from pydantic import Field, TypeAdapter, create_model
-from pydantic.fields import FieldInfo
+from pydantic import TypeAdapter
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
@@ -26,27 +24,13 @@ from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
 from rack.levels.operator import NAMED_OPERATIONS, Goal, Operation
-from rack.levels.tables import Table, describe_keys, list_live_keys, read_params
-
-TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
-"""Parameter types, by name, whose values can be checked without the level's class."""
-Constraint = Literal["gt", "ge", "lt", "le", "allow_inf_nan"]
+from rack.levels.tables import list_live_keys, read_params
 
 
 @dataclass(frozen=True)
 class PublishedParam:
-    """A parameter that an operator may set while its level runs.
+    """A parameter that an operator may set while its level runs, with its value at the launch."""
 
-    Attributes:
-        kind: Name of its type. Only the level can check values of types not in `TYPES`.
-        meaning: Meaning, with the unit.
-        constraints: Bounds of its values, by their names in pydantic.
-        launched: Value at the launch, as text.
-    """
-
-    kind: str
-    meaning: str
-    constraints: Mapping[Constraint, float | bool]
     launched: str
 
 
@@ -68,7 +52,6 @@ class PublishedLevel:
         wording: Valid names for each command that takes a name. Commands whose names are not known
             are left out.
         names: Names to which the level's alarms refer by index. See `Executor.list_names`.
-        keys: Keys of all its parameters.
         live: Its live parameters by key.
         struck_by: Fault kinds that can affect the hardware that it drives.
         findings: Events that it declares, in the order of their numbers.
@@ -77,20 +60,9 @@ class PublishedLevel:
     commands: Mapping[Operation, tuple[Goal, ...]] = field(default_factory=dict)
     wording: Mapping[Operation, tuple[str, ...]] = field(default_factory=dict)
     names: tuple[str, ...] = ()
-    keys: tuple[str, ...] = ()
     live: Mapping[str, PublishedParam] = field(default_factory=dict)
     struck_by: tuple[str, ...] = ()
     findings: tuple[PublishedFinding, ...] = ()
-
-    @property
-    def params_model(self) -> type[Table]:
-        """Model that validates the live parameters and accepts any value of the others."""
-        fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
-        for key, param in self.live.items():
-            constraints: Any = param.constraints
-            declared = Field(None, description=param.meaning, **constraints)
-            fields[key] = (TYPES.get(param.kind, Any), declared)
-        return create_model("Params", __base__=Table, **fields)
 
 
 Levels = Mapping[str, PublishedLevel]
@@ -157,12 +129,11 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
     params = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := list_live_keys(kind.params)):
-        declared = describe_keys(kind.params)
         launched = None
         # Parameters with mistakes have no values here. The rules report the mistakes.
         with suppress(LevelError):
             launched = read_params(kind.params, params)
-        live = {key: _describe_param(declared[key], getattr(launched, key, "")) for key in keys}
+        live = {key: PublishedParam(str(getattr(launched, key, ""))) for key in keys}
     wording = {Operation.SET: tuple(live)}
     if config.names_schedulers:
         commands[Operation.SCHEDULE] = ()
@@ -175,27 +146,10 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
         commands={what: tuple(goals) for what, goals in commands.items()},
         wording=wording,
         names=tuple(kind.list_names(params)),
-        keys=() if kind.params is None else tuple(kind.params.model_fields),
         live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
         findings=tuple(
             PublishedFinding(finding.name, finding.unit, finding.doc)
             for finding in kind.finding_kinds.values()
         ),
-    )
-
-
-def _describe_param(declared: FieldInfo, launched: object) -> PublishedParam:
-    """Return the facts about a live parameter, including `launched`, its value at the launch."""
-    constraints: dict[Constraint, float | bool] = {}
-    for bound in declared.metadata:
-        for key in get_args(Constraint):
-            value = getattr(bound, key, None)
-            # An infinite bound does not limit anything, and JSON cannot represent it.
-            if value is not None and isfinite(value):
-                constraints[key] = value if isinstance(value, bool) else float(value)
-    kind = getattr(declared.annotation, "__name__", "")
-    is_known = kind in TYPES
-    return PublishedParam(
-        kind, declared.description or "", constraints if is_known else {}, str(launched)
     )

@@ -20,14 +20,17 @@ from rack.boards.config.rules.mailboxes import check_exchange, check_ports
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.errors import ConfigError, format_value
 from rack.boards.faults.kind import KINDS
-from rack.levels.ports import FindingKind
 from rack.levels.tables import describe_keys
 
 REQUIRED = "required"
 NAME = ".<name>"
-LEAST = {"minimum": "at least", "exclusiveMinimum": "above"}
-MOST = {"maximum": "at most", "exclusiveMaximum": "below"}
-"""Bounds of a number by their names in JSON schema, in words. The first bound present is used."""
+BOUNDS = {
+    "exclusiveMinimum": "above",
+    "minimum": "at least",
+    "exclusiveMaximum": "below",
+    "maximum": "at most",
+}
+"""Bounds of a number by their names in JSON schema, in words. The last one of a side is used."""
 
 Schema = Mapping[str, Any]
 
@@ -100,11 +103,12 @@ def list_key_tables(config: RackConfig) -> list[KeyTable]:
         # The parameters of the network adapter are written in `[adapter.lan]`.
         if config.adapter.lan is None or board != f"board.{LAN}":
             tables += _list_model_tables(params, f"{board}.params")
-    tables += [
-        _build_findings_table(board, kind.finding_kinds)
-        for board, kind in find_executors(config).items()
-        if kind.finding_kinds
-    ]
+    for board, level in find_executors(config).items():
+        if kinds := level.finding_kinds.values():
+            heading = f"(events of board.{board})"
+            keys = [Key(k.name, "number", k.unit.removeprefix("1"), "", "", k.doc) for k in kinds]
+            meaning = "what the level may report"
+            tables.append(KeyTable(f"board.{board}.findings", heading, meaning, tuple(keys)))
     return tables
 
 
@@ -159,16 +163,14 @@ def _walk_schema(
     inner: list[KeyTable] = []
     for key, entry in schema.get("properties", {}).items():
         below = f"{path}.{key}".lstrip(".")
-        tables = [
-            *_list_inner_tables(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")
-        ]
-        inner += tables
-        if not tables:
+        inner_name = f"{name}.{key}".lstrip(".")
+        if tables := [*_list_inner_tables(entry, known, inner_name, below, f"[{below}]")]:
+            inner += tables
+        else:
             keys.append(_describe_key(key, entry, key in schema.get("required", ())))
     if keys:
-        yield KeyTable(
-            name, heading, _summarise_docstring(schema.get("description", "")), tuple(keys)
-        )
+        meaning = _summarise_docstring(schema.get("description", ""))
+        yield KeyTable(name, heading, meaning, tuple(keys))
     yield from inner
 
 
@@ -253,14 +255,12 @@ def _format_limits(entry: Schema) -> str:
         return ", ".join(map(format_value, values))
     if {"minimum", "maximum"} <= entry.keys():
         return f"{_format_number(entry['minimum'])} to {_format_number(entry['maximum'])}"
-    bounds = [
-        next(
-            (f"{word} {_format_number(entry[key])}" for key, word in kinds.items() if key in entry),
-            "",
-        )
-        for kinds in (LEAST, MOST)
-    ]
-    return ", ".join(filter(None, bounds))
+    bounds = {
+        key.removeprefix("exclusive").lower(): f"{word} {_format_number(entry[key])}"
+        for key, word in BOUNDS.items()
+        if key in entry
+    }
+    return ", ".join(bounds.values())
 
 
 def _format_number(value: float) -> str:
@@ -274,17 +274,6 @@ def _summarise_docstring(docstring: str) -> str:
     text = " ".join(docstring.partition("\n\n")[0].split())
     text = text.rpartition("]`: ")[2].partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
-
-
-def _build_findings_table(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
-    """Return the events that a level declares, as a table with a key for each event."""
-    keys = tuple(
-        Key(kind.name, "number", kind.unit.removeprefix("1"), "", "", kind.doc)
-        for kind in kinds.values()
-    )
-    return KeyTable(
-        f"board.{board}.findings", f"(events of board.{board})", "what the level may report", keys
-    )
 
 
 def _list_fault_tables() -> Iterator[KeyTable]:

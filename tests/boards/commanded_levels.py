@@ -97,7 +97,7 @@ class Lower(Executor):
         elif command.what == Operation.SET:
             self.given, why = set_live(self.given, command.name)
             if why:
-                self.orders.refuse(why)
+                self.orders.refuse_newest(why)
 
     def self_test(self) -> None:
         self.given = read_params(CountParams, self.context.params)

@@ -139,8 +139,8 @@ def test_a_restarted_board_has_its_live_params_as_they_were_set(
     {
         "level='lower', what='set', name='by=0'": "command[0].name.by = 0: should be greater than"
         " or equal to 1; counts in a cycle",
-        "level='lower', what='set', name='label=1'": "command[0].name.label = 1: it is read at the"
-        " launch only; live parameters: by",
+        "level='lower', what='set', name='label=1'": "command[0].name.label = 1: not a live"
+        " parameter; live parameters: by",
         "level='lower', what='set'": "command[0].name: must be key=value, as in bandwidth=80",
         "level='upper', what='set', name='by=1'": "command[0].what = \"set\": 'upper' does not take"
         " set; it takes: hold, resume, goto home",

@@ -114,7 +114,7 @@ def test_information_is_traced_through_the_sources_of_each_message(jointed: Make
 
 
 CIRCLES = {
-    "through many": ("board.arm.below=path", "board.arm.below", "arm -> path -> joint1 -> arm"),
+    "through many": ("board.arm.below=path", "board.arm.below", "path -> joint1 -> arm -> path"),
     "two tables disagree": ("board.arm.below=joint3", "board.arm.below", "arm -> joint3 -> arm"),
 }
 

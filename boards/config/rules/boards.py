@@ -153,11 +153,8 @@ def check_run_end(wiring: Wiring) -> Mistakes:
     """Check that at most one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
-        yield Mistake(
-            f"board.{name}.ends_run",
-            True,
-            f"only one board can end the run; '{ending[0]}' already does",
-        )
+        why = f"only one board can end the run; '{ending[0]}' already does"
+        yield Mistake(f"board.{name}.ends_run", True, why)
 
 
 LONGEST_MAJOR = 10_000
@@ -174,16 +171,12 @@ def check_clock(wiring: Wiring) -> Mistakes:
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
     if config.is_lockstep and clock.speed != 1.0:
-        yield Mistake(
-            "clock.speed",
-            clock.speed,
-            'lockstep runs as fast as it can; speed needs mode = "realtime"',
-        )
+        why = 'lockstep runs as fast as it can; speed needs mode = "realtime"'
+        yield Mistake("clock.speed", clock.speed, why)
     tick_ms = clock.period_ms / clock.speed
     if tick_ms < SHORTEST_MS:
         why = (
-            f"a tick would take {tick_ms:g} ms of real time; it must take {SHORTEST_MS:g} ms or"
-            " more"
+            f"a tick would take {tick_ms:g} ms of real time; at least {SHORTEST_MS:g} ms are valid"
         )
         yield Mistake("clock.speed", clock.speed, why)
 
@@ -208,11 +201,8 @@ def check_rates(wiring: Wiring) -> Mistakes:
             yield Mistake(place, None, str(error))
             continue
         if every > LONGEST_EVERY:
-            yield Mistake(
-                place,
-                board.rate_hz,
-                f"a cycle would take {every} ticks; it can take up to {LONGEST_EVERY}",
-            )
+            why = f"a cycle would take {every} ticks; it can take up to {LONGEST_EVERY}"
+            yield Mistake(place, board.rate_hz, why)
         if board.phase >= every:
             why = f"must be less than the board's period: 0 to {every - 1} ticks"
             yield Mistake(f"board.{name}.phase", board.phase, why)

@@ -85,23 +85,16 @@ def _check_names(table: LanTable, rack: str) -> Mistakes:
     for port, entry in table.imports.items():
         place = f"{PLACE}.import.{port}"
         if port in taken:
-            yield Mistake(
-                place, None, f"the adapter writes {taken[port]} under this name; rename the port"
-            )
+            why = f"the adapter writes {taken[port]} under this name; rename the port"
+            yield Mistake(place, None, why)
         if entry.rack == rack:
-            yield Mistake(
-                f"{place}.from",
-                entry.source,
-                "this mailbox belongs to this rack, whose levels can read it directly",
-            )
+            why = "this mailbox belongs to this rack, whose levels can read it directly"
+            yield Mistake(f"{place}.from", entry.source, why)
     for key, entries in (("export", table.exports), ("import", table.imports)):
         for source, count in count_repeated_names(entry.source for entry in entries.values()):
             ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
-            yield Mistake(
-                f"{PLACE}.{key}",
-                source,
-                f"listed {count} times: {ports}; any number of levels may read one port",
-            )
+            why = f"listed {count} times: {ports}; any number of levels may read one port"
+            yield Mistake(f"{PLACE}.{key}", source, why)
     if rack in table.peers:
         yield Mistake(f"{PLACE}.peers", rack, "this is the name of this rack itself")
     for port, _ in count_repeated_names(map(format_peer_port, table.racks)):
@@ -144,15 +137,13 @@ def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
 
     If they delayed its heartbeats, other racks would consider this rack lost.
     """
-    others = [
-        place for place in config.list_tasks() if place.core == table.core and place.board != LAN
-    ]
-    above = [
+    if above := [
         f"{place.name} {place.priority}"
-        for place in others
-        if place.priority >= max(1, table.priority)
-    ]
-    if above:
+        for place in config.list_tasks()
+        if place.core == table.core
+        and place.board != LAN
+        and place.priority >= max(1, table.priority)
+    ]:
         why = (
             f"must be above the other boards on core {table.core}, {', '.join(above)}; otherwise"
             " they can delay its signs of life"
@@ -207,9 +198,7 @@ def _check_endpoints(table: LanTable) -> Mistakes:
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
-                why = _explain_unsafe_endpoint(
-                    Endpoint.from_text(text), table, connects=key == "connect"
-                )
+                why = _explain_unsafe_endpoint(Endpoint.from_text(text), table, key)
             except ValueError as error:
                 why = str(error)
             if why:
@@ -240,15 +229,15 @@ def _list_open_endpoints(table: LanTable) -> list[str]:
     return [str(end) for end in list_endpoints(table) if not (end.has_tls or end.is_private)]
 
 
-def _explain_unsafe_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+def _explain_unsafe_endpoint(endpoint: Endpoint, table: LanTable, key: str) -> str:
     """Return the reason why an endpoint is not protected well enough. Empty if it is.
 
     Args:
         endpoint: The endpoint.
         table: The table `[adapter.lan]`.
-        connects: Whether the rack connects to the endpoint instead of listening on it.
+        key: Key of the table that contains the endpoint: "listen" or "connect".
     """
-    if endpoint.has_tls and connects and ":" in endpoint.host:
+    if endpoint.has_tls and key == "connect" and ":" in endpoint.host:
         return (
             "zenoh does not check certificates of IPv6 addresses; use a host name or an IPv4"
             " address"

@@ -77,16 +77,14 @@ def _find_place(ports: TaskPorts, port: str) -> str:
 def check_ending_status(wiring: Wiring) -> Mistakes:
     """Check that a board with `ends_run` writes a status with a field `state`."""
     for name, board in wiring.config.board.items():
-        if not board.ends_run:
-            continue
+        status = wiring.types.get(f"{name}.status")
+        why = ""
         if not wiring.is_known(f"{name}.status"):
-            yield Mistake(f"board.{name}.ends_run", True, "its executor writes no status")
-        elif (status := wiring.types.get(f"{name}.status")) is not None and not any(
-            field.name == "state" and field.unit is State for field in status.fields
-        ):
-            yield Mistake(
-                f"board.{name}.ends_run", True, "its status has no field 'state' of State"
-            )
+            why = "its executor writes no status"
+        elif status and not any(f.name == "state" and f.unit is State for f in status.fields):
+            why = "its status has no field 'state' of State"
+        if board.ends_run and why:
+            yield Mistake(f"board.{name}.ends_run", True, why)
 
 
 def check_sides(wiring: Wiring) -> Mistakes:
@@ -161,17 +159,11 @@ def check_exchange(wiring: Wiring) -> Mistakes:
         for port, entry in ports.exchange.items():
             place = f"board.{ports.task}.exchange.{port}"
             if port not in ports.inputs:
-                yield Mistake(
-                    place,
-                    None,
-                    f"no such port of the executor; ports: {', '.join(ports.inputs) or 'none'}",
-                )
+                why = f"no such port of the executor; ports: {', '.join(ports.inputs) or 'none'}"
+                yield Mistake(place, None, why)
             if entry.asynchronous and entry.every > 1:
-                yield Mistake(
-                    f"{place}.every",
-                    entry.every,
-                    "an asynchronous port is read in every cycle; must be 1",
-                )
+                why = "an asynchronous port is read in every cycle; must be 1"
+                yield Mistake(f"{place}.every", entry.every, why)
             elif entry.phase >= entry.every:
                 why = f"must be less than every: 0 to {entry.every - 1} cycles"
                 yield Mistake(f"{place}.phase", entry.phase, why)
@@ -185,17 +177,12 @@ def check_operator_mailboxes(wiring: Wiring) -> Mistakes:
     """Check that only the clock writes operator mailboxes, and that their protocol is valid."""
     for mailbox in wiring.operator_mailboxes:
         if mailbox in wiring.writers:
-            first = wiring.writers[mailbox][0].task
-            yield Mistake(
-                f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox"
-            )
+            why = "only the clock writes an operator's mailbox"
+            yield Mistake(f"mailbox {mailbox}", wiring.writers[mailbox][0].task, why)
         protocol = wiring.config.protocol.mailbox.get(mailbox)
-        if why := WHY_NOT_FOR_OPERATORS.get(protocol or ""):
-            yield Mistake(
-                f"protocol.mailbox.{mailbox}",
-                protocol,
-                f"{why}; must be time-slice or double-buffer",
-            )
+        if reason := WHY_NOT_FOR_OPERATORS.get(protocol or ""):
+            why = f"{reason}; must be time-slice or double-buffer"
+            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, why)
 
 
 def check_protocol_tables(wiring: Wiring) -> Mistakes:
@@ -268,15 +255,13 @@ def check_asynchronous(wiring: Wiring) -> Mistakes:
     """Check that no asynchronous port reads a mailbox with protocol queue or interrupt."""
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
-            why = {
-                "queue": (
-                    f"'{mailbox}' is a queue, whose messages are taken at ticks; must be false"
-                ),
-                "interrupt": (
-                    f"the messages of '{mailbox}' already interrupt the board; must be false"
-                ),
-            }.get(wiring.find_protocol(mailbox))
-            if port in ports.exchange and ports.exchange[port].asynchronous and why is not None:
+            protocol = wiring.find_protocol(mailbox)
+            if (
+                port in ports.exchange
+                and ports.exchange[port].asynchronous
+                and protocol in ("queue", "interrupt")
+            ):
+                why = f"'{mailbox}' has protocol {protocol}; must be false"
                 yield Mistake(f"board.{ports.task}.exchange.{port}.asynchronous", True, why)
 
 

@@ -158,7 +158,7 @@ UNFIT: tuple[tuple[str, Any, Callable[[Kind], bool], str], ...] = (
 """Keys with a value, the kinds that cannot have them, and what is then said."""
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [*KINDS], ids=lambda kind: kind.name)
 def test_a_key_that_a_kind_cannot_have_is_one_mistake(kind: Kind) -> None:
     for key, value, lacks, why in UNFIT:
         if lacks(kind):

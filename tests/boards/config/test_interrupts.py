@@ -62,7 +62,7 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
     [
         (
             "board.hub.exchange.below.asynchronous=true",
-            ("the messages of 'figure0.status' already interrupt the board; must be false"),
+            "'figure0.status' has protocol interrupt; must be false",
         ),
     ],
 )

@@ -35,7 +35,7 @@ def drawn(kind: Kind) -> list[list[float]]:
     return [[draw(basis) for _ in range(DRAWS)] for draw in draws if draw]
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [*KINDS], ids=lambda kind: kind.name)
 def test_the_declaration_of_each_kind_is_unchanged(kind: Kind) -> None:
     parameters = [declared(parameter) for parameter in kind.parameters]
     told = [declared(kind), parameters, str(kind.bound), kind.number]
@@ -46,7 +46,7 @@ def test_every_kind_of_the_project_is_known() -> None:
     assert SNAPSHOTS.known.keys() == BUILT_IN
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [*KINDS], ids=lambda kind: kind.name)
 def test_drawn_values_are_permitted_ones(kind: Kind) -> None:
     for seed in range(40):
         d = Drawing(Random(seed), cycle=2, reader=8, second=400.0, joints=6)

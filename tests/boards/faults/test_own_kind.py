@@ -26,7 +26,7 @@ GAUGED = PLAIN.replace("wave_levels:Wave", f"{MODULE}:Gauge").replace(
 @pytest.fixture(autouse=True)
 def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget the kind after the test: other tests go through all kinds."""
-    monkeypatch.setattr(KINDS, "_by_name", dict(KINDS._by_name))
+    monkeypatch.setattr(KINDS, "names", dict(KINDS.names))
     monkeypatch.setattr(KINDS, "_by_number", dict(KINDS._by_number))
     yield
     sys.modules.pop(MODULE, None)

@@ -61,10 +61,7 @@ MISTAKES = {
     ),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
-        (
-            "clock.speed = 500.0: a tick would take 0.005 ms of real time; it must take 0.01 ms or"
-            " more"
-        ),
+        "clock.speed = 500.0: a tick would take 0.005 ms of real time; at least 0.01 ms are valid",
     ),
     "very long cycle": (
         "board.lower={ rate_hz = 1e-5 }",
@@ -132,7 +129,7 @@ MISTAKES = {
     "two writers": ("board.lower.executor='two_levels:PlanWriter'", "mailbox lower.plan"),
     "protocol": (
         "protocol.mailbox={ 'lower.state' = 'lock' }",
-        "protocol.mailbox.lower.state: no such mailbox",
+        'protocol.mailbox.lower.state = "lock": no such mailbox',
     ),
     "size": (
         "board.lower.planner='two_levels:SizedPlanner'",
