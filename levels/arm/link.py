@@ -1,4 +1,4 @@
-"""What passes between the servo level and an arm: samples, set points and states of drives."""
+"""Samples, set points and states of drives, which pass between the servo level and an arm."""
 
 from __future__ import annotations
 

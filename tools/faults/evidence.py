@@ -33,6 +33,7 @@ LATCHED = "latched"
 """Code of the reaction to a fault that lasted too long: brakes stay closed and the task ends."""
 COLLISION = Alarm.COLLISION.name.lower()
 """Code of a collision. Brakes that close in the same tick are a reaction to it."""
+SKIPPED = Alarm.CLOCK_SKIPPED.name.lower()
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Code of the recovery that undoes each reaction."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
@@ -121,24 +122,17 @@ def concerns_target(event: Event, strike: Strike) -> bool:
     return not event.subject or not strike.joint or event.subject in (strike.joint, ALL_JOINTS)
 
 
-class SkippedTicks:
-    """The ticks that the clock skipped in a run."""
+def count_skipped_ticks(events: Iterable[Event], first: int, last: int) -> int:
+    """Return the number of ticks that the clock skipped after tick `first`, up to `last`.
 
-    def __init__(self, events: Sequence[Event]) -> None:
-        name = Alarm.CLOCK_SKIPPED.name.lower()
-        self._skips = [event for event in events if event.kind == "miss" and event.code == name]
-
-    def count_between(self, first: int, last: int) -> int:
-        """Return the number of ticks that the clock skipped after tick `first`, up to `last`.
-
-        Each task reports only the skips that it notices, so the result is the largest number that
-        any one task reported.
-        """
-        by_task = Counter[str]()
-        for event in self._skips:
-            if first < event.tick <= last:
-                by_task[event.board] += int(event.value)
-        return min(max(by_task.values(), default=0), max(0, last - first))
+    Each task reports only the skips that it notices, so the result is the largest number that any
+    one task reported.
+    """
+    by_task = Counter[str]()
+    for event in events:
+        if event.kind == "miss" and event.code == SKIPPED and first < event.tick <= last:
+            by_task[event.board] += int(event.value)
+    return min(max(by_task.values(), default=0), max(0, last - first))
 
 
 class Aftermath(NamedTuple):

@@ -20,10 +20,11 @@ from rack.tools.faults.evidence import (
     DETECTION_KINDS,
     LATCHED,
     MAILBOX_ALARMS,
+    SKIPPED,
     Detection,
-    SkippedTicks,
     can_be_detection,
     can_explain,
+    count_skipped_ticks,
     find_aftermath,
 )
 
@@ -157,7 +158,6 @@ class Judge:
         self._strikes = sorted(strikes, key=lambda strike: (strike.first_tick, strike.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
-        self._skipped = SkippedTicks(events)
         self._last = max((event.tick for event in events), default=0)
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
@@ -273,8 +273,8 @@ class Judge:
     def _build_detection(self, event: Event, strike: Strike) -> Detection:
         """Build the detection of a fault from an event. Compute its delay and its bound."""
         delay = max(0, event.tick - strike.tick)
-        if event.code != "clock_skipped":
-            delay -= self._skipped.count_between(strike.tick, event.tick)
+        if event.code != SKIPPED:
+            delay -= count_skipped_ticks(self._events, strike.tick, event.tick)
         reader = event.board if event.code in MAILBOX_ALARMS else None
         bound = self._compute_bound(strike, reader)
         if self._run.is_lockstep:

@@ -9,7 +9,7 @@ import pytest
 
 from rack.tools.faults.evidence import (
     Aftermath,
-    SkippedTicks,
+    count_skipped_ticks,
     find_aftermath,
 )
 from tests.tools.fault_events import event, strike
@@ -17,15 +17,13 @@ from tests.tools.fault_events import event, strike
 KILL = strike("kill", "lower", 100)
 
 
-SKIPS = SkippedTicks(
-    [
-        replace(event(10, "miss", "clock_skipped", "a"), value=2.0),
-        replace(event(20, "miss", "clock_skipped", "a"), value=3.0),
-        replace(event(20, "miss", "clock_skipped", "b"), value=4.0),
-        replace(event(20, "detection", "clock_skipped", "c"), value=90.0),
-        replace(event(20, "miss", "late", "d"), value=90.0),
-    ]
-)
+SKIPS = [
+    replace(event(10, "miss", "clock_skipped", "a"), value=2.0),
+    replace(event(20, "miss", "clock_skipped", "a"), value=3.0),
+    replace(event(20, "miss", "clock_skipped", "b"), value=4.0),
+    replace(event(20, "detection", "clock_skipped", "c"), value=90.0),
+    replace(event(20, "miss", "late", "d"), value=90.0),
+]
 
 
 @pytest.mark.parametrize(
@@ -44,7 +42,7 @@ SKIPS = SkippedTicks(
 def test_skipped_ticks_are_counted_by_one_task_and_bounded(
     first: int, last: int, skipped: int
 ) -> None:
-    assert SKIPS.count_between(first, last) == skipped
+    assert count_skipped_ticks(SKIPS, first, last) == skipped
 
 
 RESTART = event(105, "reaction", "restart", "lower")

@@ -35,7 +35,9 @@ class EarlyEnd:
         if tick < 0 or self.is_reached:
             return
         struck = list_strikes(self._rack.segment, self._joints)
-        certain_at = find_certain_tick(struck, self._rack.events, self._run, tick)
+        # The rack has not ended, but the judge needs to know how far it has run.
+        events = [*self._rack.events, Event(0, tick, "end", "", "")]
+        certain_at = ForesightedJudge(struck, events, self._run).find_certain_tick(tick)
         if certain_at is None:
             # The verdict needs the whole run, so do not hold the rack again.
             self._words[System.HOLD_AT] = 0
@@ -51,30 +53,19 @@ class EarlyEnd:
         self._words[System.HOLD_AT] = tick + 1
 
 
-def find_certain_tick(
-    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
-) -> int | None:
-    """Return the tick from which no later event can change the judgement of a run's faults.
-
-    Args:
-        strikes: Faults of the run so far.
-        events: Events of the run so far.
-        run: Facts about the run.
-        tick: Tick before which the rack is held.
-
-    Returns:
-        A tick up to `tick` if the judgement is final, a later tick at which to check again, or None
-        if the judgement needs the whole run.
-    """
-    end_event = Event(0, tick, "end", "", "")
-    return _ForesightedJudge(strikes, [*events, end_event], run).find_certain_tick(tick)
-
-
-class _ForesightedJudge(Judge):
+class ForesightedJudge(Judge):
     """Evaluates faults and also computes when the judgements become final."""
 
     def find_certain_tick(self, tick: int) -> int | None:
-        """Return the tick from which all judgements are final: see `find_certain_tick` above."""
+        """Return the tick from which no later event can change a judgement.
+
+        Args:
+            tick: Tick before which the rack is held.
+
+        Returns:
+            A tick up to `tick` if all judgements are final, a later tick at which to check again,
+            or None if they need the whole run.
+        """
         latest = tick
         for strike, judgement in zip(self._strikes, self.judge_all().faults, strict=True):
             certain_tick = self._find_fault_certain_tick(strike, judgement, tick)

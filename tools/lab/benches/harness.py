@@ -116,7 +116,6 @@ def run_program(
     argv: Sequence[str],
     timeout_s: float,
     environment: Mapping[str, str] | None = None,
-    input_text: str = "",
 ) -> subprocess.CompletedProcess[str]:
     """Run a program to its end.
 
@@ -127,7 +126,6 @@ def run_program(
         argv: Program and arguments.
         timeout_s: Longest permitted time, s.
         environment: All of its environment variables. None to inherit them.
-        input_text: Text for its standard input.
 
     Returns:
         Exit status and output.
@@ -139,14 +137,14 @@ def run_program(
     process = subprocess.Popen(
         argv,
         env=environment,
-        stdin=pipe,
+        stdin=subprocess.DEVNULL,
         stdout=pipe,
         stderr=pipe,
         text=True,
         errors="replace",
     )
     try:
-        stdout, stderr = process.communicate(input_text, timeout=timeout_s)
+        stdout, stderr = process.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
         raise Failure(f"{label}: still running after {timeout_s:g} s") from None
     finally:
