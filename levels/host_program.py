@@ -38,7 +38,7 @@ from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext, Program
-from rack.levels.ports import InputPort, M, OutputPort, collect_ports
+from rack.levels.ports import InputPort, M, WrittenPort, collect_ports
 from rack.levels.tables import Table
 
 M_co = TypeVar("M_co", bound=Message, covariant=True)
@@ -154,7 +154,7 @@ class ProgramInput(InputPort[M, HostReceiver[M]]):
     """
 
 
-class ProgramOutput(OutputPort[M, HostSender[M]]):
+class ProgramOutput(WrittenPort[M, HostSender[M]]):
     """A port that a host program writes; the attribute is a `HostSender`.
 
     A bus adapter reads its mailbox, `<board>.<port>`.
@@ -179,7 +179,7 @@ class HostProgram:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (OutputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
             if not isinstance(port, ProgramInput | ProgramOutput):
                 raise LevelError(

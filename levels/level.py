@@ -119,10 +119,10 @@ from rack.levels.ports import (
     InputPort,
     Inputs,
     Output,
-    OutputPort,
     QueuedOutput,
     Sender,
     TimedOutput,
+    WrittenPort,
     collect_ports,
 )
 from rack.levels.tables import (
@@ -268,7 +268,7 @@ class LevelSection:
 
     inputs: ClassVar[Mapping[str, InputPort[Any, Any]]] = {}
     """The ports that it reads, by name, collected from the class and its bases."""
-    outputs: ClassVar[Mapping[str, OutputPort[Any, Any]]] = {}
+    outputs: ClassVar[Mapping[str, WrittenPort[Any, Any]]] = {}
     """The ports that it writes, by name, collected in the same way.
 
     A planner has the single port "plan".
@@ -299,7 +299,7 @@ class LevelSection:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (OutputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -111,7 +111,7 @@ class Inputs(InputPort[M, Mapping[str, Reading[M]]]):
         return {}
 
 
-class OutputPort(Port[M, V]):
+class WrittenPort(Port[M, V]):
     """A port that a level writes.
 
     Args:
@@ -150,10 +150,10 @@ class OutputPort(Port[M, V]):
         return (tick - phase + every) % (self.cycles * every) == 0
 
 
-class Output(OutputPort[M, M]):
+class Output(WrittenPort[M, M]):
     """A port that a level writes; the attribute is a message, written at the end of each cycle.
 
-    Fields keep their values from cycle to cycle. See `OutputPort` for the arguments.
+    Fields keep their values from cycle to cycle. See `WrittenPort` for the arguments.
     """
 
     def build_unconnected(self, level: Any) -> M:
@@ -180,7 +180,7 @@ class Sender(Generic[M]):
     room: Callable[[], int]
 
 
-class QueuedOutput(OutputPort[M, Sender[M]]):
+class QueuedOutput(WrittenPort[M, Sender[M]]):
     """A port that sends any number of messages in a cycle through a queue, so none is missed.
 
     The attribute is a `Sender`.
@@ -189,7 +189,7 @@ class QueuedOutput(OutputPort[M, Sender[M]]):
     queued = True
 
 
-class TimedOutput(OutputPort[M, Sender[M]]):
+class TimedOutput(WrittenPort[M, Sender[M]]):
     """A port that is written only in the cycles in which the level sends its message.
 
     The attribute is a `Sender`.
@@ -212,7 +212,7 @@ class ConfiguredPorts(NamedTuple):
     """
 
     inputs: Mapping[str, InputPort[Any, Any]] = MappingProxyType({})
-    outputs: Mapping[str, OutputPort[Any, Any]] = MappingProxyType({})
+    outputs: Mapping[str, WrittenPort[Any, Any]] = MappingProxyType({})
     is_complete: bool = True
 
 

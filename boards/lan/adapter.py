@@ -39,7 +39,7 @@ from rack.boards.wiring import RecordedEntries
 from rack.levels.errors import LevelError
 from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, TimedOutput
 from rack.levels.peer import PeerPresence, format_peer_port
-from rack.levels.ports import OutputPort
+from rack.levels.ports import WrittenPort
 from rack.levels.tables import read_params
 
 _LAUNCH_MASK = (1 << 62) - 1
@@ -96,7 +96,7 @@ class LanAdapter(Adapter):
         # The status depends on the export of the same name, if there is one.
         rests_on = inputs.get(STATUS)
         status = Output(build_status_class(table.exports, table.imports), rests_on=rests_on)
-        outputs: dict[str, OutputPort[Any, Any]] = {STATUS: status}
+        outputs: dict[str, WrittenPort[Any, Any]] = {STATUS: status}
         for port, entry in table.imports.items():
             try:
                 outputs[port] = TimedOutput(entry.find_message_class(), entry.max_age_ms * 1e-3)

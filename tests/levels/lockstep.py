@@ -20,9 +20,9 @@ from rack.levels.level import (
     Executor,
     InputPort,
     LevelContext,
-    OutputPort,
     Pace,
     Planner,
+    WrittenPort,
 )
 from rack.levels.operator import Goal, Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, compute_sizes
@@ -273,7 +273,7 @@ def made_ports(board: BoardSpec, level: Executor | Planner) -> ConfiguredPorts:
     )
 
 
-def outputs_of(board: BoardSpec) -> dict[str, OutputPort[Any, Any]]:
+def outputs_of(board: BoardSpec) -> dict[str, WrittenPort[Any, Any]]:
     return {**board.executor.outputs, **board.executor.build_ports(board.params, {}).outputs}
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import ValidationError
+from pydantic import ValidationError, model_validator
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
@@ -55,15 +55,16 @@ class FrameConfig(Table):
     z: Vector
     """its z axis, at a right angle to x"""
 
-    def find_axes_error(self) -> str:
-        """Return the reason why the axes do not define a frame, or an empty string if they do."""
+    @model_validator(mode="after")
+    def _check_axes(self) -> FrameConfig:
+        """Check that the axes define a frame."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
-            return "an axis of length 0: no frame"
+            raise ValueError("an axis of length 0: no frame")
         cosine = float((np.array(self.x) * self.z).sum()) / lengths
         if abs(cosine) > MAX_COSINE:
-            return "its axes x and z are not at a right angle: no frame"
-        return ""
+            raise ValueError("its axes x and z are not at a right angle: no frame")
+        return self
 
     @property
     def quaternion(self) -> Array:
@@ -100,16 +101,9 @@ class ForceProgram(Program):
     """contacts, by name"""
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield invalid frames, and contacts in unknown frames or beyond the limits of the arm."""
-        bent = {
-            name: reason
-            for name, frame in self.frame.items()
-            if (reason := frame.find_axes_error())
-        }
-        for name, reason in bent.items():
-            yield f"frame.{name}", self.frame[name].model_dump(), reason
+        """Yield contacts in unknown frames or beyond the limits of the arm."""
         for name, contact in self.contact.items():
-            if contact.frame not in bent and (reason := self.find_contact_error(contact, robot)):
+            if reason := self.find_contact_error(contact, robot):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def find_contact_error(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
