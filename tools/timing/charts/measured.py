@@ -120,12 +120,10 @@ class TracedRun:
     @cached_property
     def end_ns(self) -> int:
         """End of the last traced cycle, in ns."""
-        traces = self.recording.cycles.items()
         layout = self.recording.layout
         end_ticks = [
             int(rows["tick"][-1]) + layout.find_task(task).every
-            for task, rows in traces
-            if len(rows)
+            for task, rows in self.recording.cycles.items()
         ]
         return max(end_ticks, default=0) * self.config.tick_ns
 
