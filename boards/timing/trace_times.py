@@ -15,23 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
-from rack.boards.timing.tasks import Unit
 
 STAMPS = ("start_ns", "plan_ns", "read_ns", "process_ns", "end_ns")
 """Time stamps of a record, in order."""
-UNITS = {
-    "executor": (
-        (Unit.EXCHANGE, "start_ns", "plan_ns"),
-        (Unit.READ, "plan_ns", "read_ns"),
-        (Unit.PROCESS, "read_ns", "process_ns"),
-        (Unit.WRITE, "process_ns", "end_ns"),
-    ),
-    "planner": ((Unit.PLAN, "start_ns", "process_ns"), (Unit.UPDATE, "process_ns", "end_ns")),
-}
-"""Unit functions of a record, by role, with their first and last time stamps.
-
-The reading of a planner is part of P.
-"""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
 UNDISTURBED = 10.0
 """Percentile that is taken as the undisturbed time of a part.
@@ -204,29 +190,15 @@ class Occupation:
         return np.asarray(np.where(begun > 0, self._sums[newest] - beyond, 0))
 
 
-def compute_waking_ns(rows: TraceRows) -> Values:
-    """Return the processor time in ns that waking up took before the start of each cycle."""
-    return np.asarray(
-        np.clip(_compute_unstamped_ns(rows), 0, np.maximum(compute_lateness_ns(rows), 0))
-    )
-
-
 def compute_overhead_ns(rows: TraceRows) -> int:
     """Return the median processor time in ns for waking up and for closing a cycle.
 
     It is 0 if every cycle was preempted.
     """
-    beyond = _compute_unstamped_ns(rows)
+    # The processor time before the start and after the end, which is negative after a preemption.
+    beyond = rows["processor_ns"] - compute_duration_ns(rows)
     undisturbed = beyond[beyond >= 0]
     return int(np.median(undisturbed)) if len(undisturbed) else 0
-
-
-def _compute_unstamped_ns(rows: TraceRows) -> Values:
-    """Return the processor time in ns that each cycle used before its start and after its end.
-
-    It is negative if the cycle was preempted.
-    """
-    return np.asarray(rows["processor_ns"] - compute_duration_ns(rows))
 
 
 def compute_unit_times(rows: TraceRows, above: Occupation) -> Values:

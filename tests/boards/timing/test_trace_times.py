@@ -7,6 +7,7 @@ import numpy as np
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.timing import trace_times
 from rack.boards.timing.trace_times import Occupation, compute_plan_ages
+from rack.tools.timing.charts.measured import compute_waking_ns
 
 
 def test_a_plan_ages_until_the_next_one_can_be_read() -> None:
@@ -101,10 +102,10 @@ def test_a_task_needs_its_core_from_waking_up_to_closing_the_cycle() -> None:
 
 def test_wake_up_time_is_the_unstamped_time_up_to_the_lateness() -> None:
     rows = records(*(cycle(1000, USUAL, processor) for processor in (90, 100, 104, 130)))
-    assert trace_times.compute_waking_ns(rows).tolist() == [0, 0, 4, 10]
+    assert compute_waking_ns(rows).tolist() == [0, 0, 4, 10]
     # Its clock board stamped the release after its start.
     rows["release_ns"] = 1011
-    assert trace_times.compute_waking_ns(rows).tolist() == [0, 0, 0, 0]
+    assert compute_waking_ns(rows).tolist() == [0, 0, 0, 0]
 
 
 def test_the_overhead_is_the_median_of_undisturbed_cycles() -> None:

@@ -17,9 +17,9 @@ from rack.boards.config import RackConfig, build_rack_timing
 from rack.boards.timing.schedule import Chart, Job, Span
 from rack.boards.timing.tasks import Budget, TimedTask, Unit
 from rack.boards.timing.trace_times import (
-    UNITS,
+    compute_duration_ns,
+    compute_lateness_ns,
     compute_response_ns,
-    compute_waking_ns,
     count_skipped_releases,
     select_plans,
 )
@@ -34,6 +34,19 @@ from rack.tools.timing.charts.patterns import (
     count_patterns,
 )
 
+UNITS = {
+    "executor": (
+        (Unit.EXCHANGE, "start_ns", "plan_ns"),
+        (Unit.READ, "plan_ns", "read_ns"),
+        (Unit.PROCESS, "read_ns", "process_ns"),
+        (Unit.WRITE, "process_ns", "end_ns"),
+    ),
+    "planner": ((Unit.PLAN, "start_ns", "process_ns"), (Unit.UPDATE, "process_ns", "end_ns")),
+}
+"""Unit functions of a record, by role, with their first and last time stamps.
+
+The reading of a planner is part of P.
+"""
 BLOCK_NS = 1_000_000_000
 """Length of the part of a run that is read at once, ns, which limits the required memory."""
 
@@ -107,12 +120,10 @@ class TracedRun:
     @cached_property
     def end_ns(self) -> int:
         """End of the last traced cycle, in ns."""
-        traces = self.recording.cycles.items()
         layout = self.recording.layout
         end_ticks = [
             int(rows["tick"][-1]) + layout.find_task(task).every
-            for task, rows in traces
-            if len(rows)
+            for task, rows in self.recording.cycles.items()
         ]
         return max(end_ticks, default=0) * self.config.tick_ns
 
@@ -158,6 +169,12 @@ class TracedRun:
             rows = select_plans(rows) if task.role == "planner" else rows
             records[task.name] = rows, max(compute_response_ns(rows).tolist(), default=0)
         return records
+
+
+def compute_waking_ns(rows: np.ndarray) -> np.ndarray:
+    """Return the processor time in ns that waking up took before the start of each cycle."""
+    beyond_stamps = rows["processor_ns"] - compute_duration_ns(rows)
+    return np.asarray(np.clip(beyond_stamps, 0, np.maximum(compute_lateness_ns(rows), 0)))
 
 
 class _TaskTrace(NamedTuple):
