@@ -171,12 +171,8 @@ class Recording:
     def _read_text(self, name: str) -> str:
         """Read a text file of the run. Raises `Failure` if it is missing or not text."""
         path = self._require_file(name)
-        try:
+        with _convert_read_errors(path):
             return read_file(path).decode()
-        except UnicodeDecodeError as error:
-            raise Failure(
-                f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2
-            ) from None
 
     def _require_file(self, name: str) -> Path:
         """Return the path of a file that every run has. Raises `Failure` if it is missing."""
