@@ -77,13 +77,11 @@ def recorded(
     others: Sequence[Machine],
     folder: Path,
     seed: int = 1,
-    counts_from: int = 0,
 ) -> Recording:
     """Write the recording of a rack that compared its clock with those of others, each time with an
     error.
 
-    In lockstep it counts from a number, and takes the count of the others from there, each 4 ticks
-    late.
+    In lockstep it counts, and takes the count of the others, each 4 ticks late.
     """
     config = config_of(machine, [other.rack for other in others], folder)
     (folder / "config.toml").write_text(config.to_toml_text())
@@ -108,7 +106,7 @@ def recorded(
             rows = np.zeros(ticks // 4, build_row_dtype(layout.find_mailbox(name)))
             rows["basis"] = np.arange(0, ticks, 4)
             rows["tick"] = rows["basis"] + TICKS - ticks
-            rows["message"]["count"] = counts_from + rows["basis"]
+            rows["message"]["count"] = rows["basis"]
             signals[name].add_rows(rows)
     for table in signals.values():
         table.close()

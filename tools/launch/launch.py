@@ -371,12 +371,14 @@ def compare_recording(
             ):
                 first, last = absent[0]
                 return f"ticks {first:,} to {last:,} should have been kept but are missing", {}
+        if not missing:
+            return "complete", {}
+        rows_lost = {name: loss.rows for name, loss in missing.items()}
+        gaps = Recording(folder).find_gaps(rows_lost, ticks)
     except Failure as error:
         return f"{why}; {error}", {}
-    if not missing:
-        return "complete", {}
     most, name = max((loss, name) for name, loss in missing.items())
     text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
     if len(missing) > 1:
         text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
-    return f"{text}; {why}", {name: loss.rows for name, loss in missing.items()}
+    return "; ".join((text, *map(str, gaps), why)), rows_lost

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
@@ -171,12 +171,8 @@ class Recording:
     def _read_text(self, name: str) -> str:
         """Read a text file of the run. Raises `Failure` if it is missing or not text."""
         path = self._require_file(name)
-        try:
+        with _convert_read_errors(path):
             return read_file(path).decode()
-        except UnicodeDecodeError as error:
-            raise Failure(
-                f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2
-            ) from None
 
     def _require_file(self, name: str) -> Path:
         """Return the path of a file that every run has. Raises `Failure` if it is missing."""
@@ -240,15 +236,20 @@ class Recording:
         text = " and ".join([*spans[:MAX_SHOWN_STRETCHES], *more])
         return f"kept {text}; the rest was not kept, as [record] keep says" if text else ""
 
-    def find_gaps(self) -> list[Gap]:
+    def find_gaps(self, lost: Mapping[str, int] | None = None, ticks: int = 0) -> list[Gap]:
         """Find the ranges of ticks in which rows are missing. Overlapping ranges are merged.
 
-        If the end of the run counts more lost rows of a ring than the files report, the additional
-        rows are assumed to be missing between the ring's last recorded row and the end of the run.
+        Args:
+            lost: Number of lost rows of each task and mailbox. Defaults to the counts at the end of
+                the run.
+            ticks: Length of the run in ticks, if `lost` is given. If `lost` counts more rows of a
+                ring than the files report, the additional rows are assumed to be missing between
+                the last recorded row of the ring and this tick.
         """
-        ticks = self.end_counts.get("outcome", {}).get("ticks", 0)
+        if lost is None:
+            lost, ticks = self.lost_rows, self.end_counts.get("outcome", {}).get("ticks", 0)
         gaps = list(self._gaps)
-        for name, count in self.lost_rows.items():
+        for name, count in lost.items():
             if count > self._lost_before_end.get(name, 0):
                 gaps.append((name, self._find_last_tick(name) + 1, ticks - 1))
         merged: list[Gap] = []

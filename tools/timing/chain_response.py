@@ -35,7 +35,7 @@ class Origins(NamedTuple):
     list_delays: Callable[[float, float], Iterator[str]]
 
 
-class Chain(NamedTuple):
+class BoardChain(NamedTuple):
     """A chain of boards.
 
     Attributes:
@@ -50,7 +50,7 @@ class Chain(NamedTuple):
 
 
 def measure_direction(
-    recording: Recording, levels: Sequence[str], bound_ms: float, chains: Iterable[Chain]
+    recording: Recording, levels: Sequence[str], bound_ms: float, chains: Iterable[BoardChain]
 ) -> Document:
     """Return the responses along parallel chains in one direction as plain data.
 
@@ -79,7 +79,7 @@ def measure_direction(
 
 
 def _measure_chain(
-    recording: Recording, chain: Chain, bound_ms: float
+    recording: Recording, chain: BoardChain, bound_ms: float
 ) -> tuple[np.ndarray, list[Document], int]:
     """Measure the responses along one chain.
 

@@ -26,7 +26,7 @@ from rack.tools.console.answer import Document
 from rack.tools.monitor.network import ADAPTER, STATUS, read_entries
 from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.chain_response import NOT_MEASURED, Chain, Origins, measure_direction
+from rack.tools.timing.chain_response import NOT_MEASURED, BoardChain, Origins, measure_direction
 
 
 def measure_system_response(recording: Recording) -> Document | None:
@@ -102,7 +102,9 @@ def _measure_direction(
         * layout.clock_ns
         * 1e-6
     )
-    measured = [Chain(boards[start:], boxes[-hop_count:]) for boards, boxes in paths if hop_count]
+    measured = [
+        BoardChain(boards[start:], boxes[-hop_count:]) for boards, boxes in paths if hop_count
+    ]
     return measure_direction(recording, levels[start:], bound_ms, measured)
 
 
@@ -124,7 +126,7 @@ def _measure_joined_responses(
     for group in groups.values():
         boxes = [find_path_mailboxes(recording.layout, (ADAPTER, *each.boards)) for each in group]
         chains = [
-            Chain((ADAPTER, *each.boards), row, _find_origins(recording, each))
+            BoardChain((ADAPTER, *each.boards), row, _find_origins(recording, each))
             for each, row in zip(group, boxes, strict=True)
             if len(row) == len(each.boards)
             and row[0].name == f"{ADAPTER}.{each.port}"

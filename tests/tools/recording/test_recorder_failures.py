@@ -151,7 +151,7 @@ def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     assert set(gap.rings) == set(result.rows_lost)
     others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
     lacking = f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing ({others})"
-    assert result.recording == f"{lacking}; the recorder ended with status -9"
+    assert result.recording == f"{lacking}; {gap}; the recorder ended with status -9"
     assert result.describe_failure().endswith(result.recording)
     report, text = write_report(tmp_path / "run")
     assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
