@@ -21,8 +21,11 @@ from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find_floor_height
 from rack.tools.viewer.curves import (
+    AXES,
     BY_FINGER,
+    CONTACT_UNITS,
     ERROR,
+    FORCES,
     GRIPPER,
     HAND,
     JOINTS,
@@ -35,7 +38,6 @@ from rack.tools.viewer.curves import (
     has_curves,
 )
 from rack.tools.viewer.events import EVENTS, RACK_LANE
-from rack.tools.viewer.forces import AXES, CONTACT_UNITS, FORCES
 from rack.tools.viewer.levels import (
     HIERARCHY,
     LEVELS,
