@@ -60,7 +60,7 @@ def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", (1, -1))
+@pytest.mark.parametrize("step", [1, -1])
 def test_the_goal_of_a_move_does_not_depend_on_how_the_recorder_reads_rings(
     run: Recording, tmp_path: Path, step: int
 ) -> None:
