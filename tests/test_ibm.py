@@ -15,7 +15,7 @@ from rack.tools.commands.status import status
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.plots.graph import build_graphs
+from rack.tools.plots.graph import build_graph
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 
@@ -108,7 +108,7 @@ def test_the_graph_shows_the_present_connections_of_blocks(tmp_path: Path) -> No
     settings = [f"name=test-ibm-graph-{os.getpid()}", "clock.mode=lockstep"]
     with Rack(load("ibm/light-touch", settings)) as rack:
         rack.run(7.5)
-        (blocks,) = build_graphs(rack.segment)
+        blocks = build_graph(rack.segment)
         status(rack.segment.rack, tmp_path / "graph.svg")
         with pytest.raises(Failure, match=r"--graph graph.pdf: the name .* end in .png or .svg"):
             status(rack.segment.rack, Path("graph.pdf"))

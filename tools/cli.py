@@ -82,7 +82,6 @@ COMMAND_SOURCES = {
     "resume": "rack.tools.commands.pause:resume",
     "list": "rack.tools.commands.list:list_racks",
     "set": "rack.tools.commands.command:set_param",
-    "inject": "rack.tools.commands.inject:app",
     "robot": "rack.tools.commands.robot:app",
     "lan": "rack.tools.network.group:app",
 }

@@ -46,7 +46,7 @@ class FaultConfig(Table):
     __pydantic_extra__: dict[str, Parameter]
 
     kind: str
-    """kind of fault; 'rack inject --help' lists the kinds"""
+    """kind of fault; 'rack inject --list' lists the kinds"""
     board: str
     """affected task: a board (servo), its planner (servo.planner), or clock"""
     tick: Tick | None = None

@@ -179,7 +179,7 @@ def show_on_terminal(arguments: list[str], columns: int) -> str:
 def test_a_terminal_of_40_columns_gets_a_narrower_layout_without_colours(
     recorded: Path, tmp_path: Path, rack_name: str
 ) -> None:
-    lines = ["check nasrem --verbose", "check fig3", "schema timing", "inject --help"]
+    lines = ["check nasrem --verbose", "check fig3", "schema timing", "inject --list"]
     with held_rack(tmp_path, rack_name):
         for line in (*lines, f"analyze {recorded} --verbose", f"status {rack_name}"):
             shown = show_on_terminal(line.split(), 40)

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
-
-import typer
-from typer.core import TyperCommand
 
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import (
@@ -27,7 +23,7 @@ def inject(
     board: str | None = argument(
         "BOARD", "task to disturb: servo, servo.planner, ..., or clock", None
     ),
-    kind: str | None = argument("KIND", "kind of fault; the kinds are listed below", None),
+    kind: str | None = argument("KIND", "kind of fault, as 'rack inject --list' shows it", None),
     parameters: list[str] | None = argument(
         "KEY=VALUE", "parameters of the kind, as in size=0.05", None
     ),
@@ -116,17 +112,6 @@ def _parse_parameters(parameters: list[str]) -> dict[str, str]:
     return values
 
 
-class KindsCommand(TyperCommand):
-    """A command whose help ends with the kinds of faults.
-
-    They are imported only when the help is shown.
-    """
-
-    def get_help(self, ctx: Any) -> str:
-        """Return the help, with the kinds of faults at the end."""
-        return "\n".join([super().get_help(ctx), "", "Kinds:", *format_kinds()])
-
-
 def format_kinds() -> Iterator[str]:
     """Yield the lines of a table of fault kinds, and of a table of their parameters."""
     from rack.boards.faults import KINDS
@@ -181,7 +166,3 @@ def build_kinds_document() -> list[Document]:
         }
         for kind in KINDS
     ]
-
-
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
-app.command(cls=KindsCommand)(inject)

@@ -17,8 +17,7 @@ from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.pictures import check_picture_path
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.signals import SignalHistory
-from rack.tools.plots.curves import Plot, Series, read_series
-from rack.tools.plots.marks import Mark, list_marks
+from rack.tools.plots.curves import Mark, Plot, Series, list_marks, read_series
 from rack.tools.plots.terminal import NO_CURVES, draw_plot
 from rack.tools.recording.divergence import find_other_run, find_tick_range
 from rack.tools.recording.recording import Recording

@@ -57,9 +57,9 @@ def status(
         check_picture_path("--graph", graph)
     with closing(Segment.attach(rack or find_only_rack())) as segment:
         if graph is not None:
-            from rack.tools.plots.graph import build_graphs, save_graphs
+            from rack.tools.plots.graph import build_graph, save_graph
 
-            save_graphs(build_graphs(segment), graph)
+            save_graph(build_graph(segment), graph)
             return
         snapshot = RackMonitor(segment).take_snapshot()
         run = find_run_folder(segment)

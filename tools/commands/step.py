@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from rack.backplane.segment import Segment
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName, argument, option
+from rack.tools.console.tables import format_fitted_records
 from rack.tools.monitor.pausing import Stepper
 
 
 def step(
     rack: RackName,
-    count: int | None = argument("N", "cycles; the same as --cycles", None, min=1, max=1_000_000),
-    cycles: int | None = option(
-        "--cycles N", "cycles of the slowest level, or of --until", min=1, max=1_000_000
+    cycles: int | None = argument(
+        "N", "cycles of the slowest level, or of --until", None, min=1, max=1_000_000
     ),
     ticks: int | None = option(
         "--ticks N", "ticks of the clock, instead of cycles", min=1, max=10**9
@@ -41,13 +39,8 @@ def step(
       rack step nist-state-table --ticks 1
       rack step nist-state-table --run
     """
-    if count is not None and cycles is not None:
-        raise Failure(f"N = {count}: N and --cycles mean the same; give one of them", 2)
-    cycles = cycles if count is None else count
     if ticks is not None and (cycles is not None or until is not None):
-        raise Failure(
-            "--ticks counts ticks, but N, --cycles and --until count cycles; give one of them", 2
-        )
+        raise Failure("--ticks counts ticks, but N and --until count cycles; give one of them", 2)
     if run and any(value is not None for value in (cycles, ticks, until)):
         raise Failure("--run lets the rack run without holding; leave out the steps", 2)
     stepper = Stepper(Segment.attach(rack))
@@ -60,5 +53,6 @@ def step(
         stepper.find_end_tick(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks
     )
     stepper.run_to(end_tick)
-    held_rack = stepper.describe_rack()
-    print_answer(asdict(held_rack), held_rack.format_lines(), as_json)
+    held = stepper.describe_rack()
+    head = "{rack}: held before tick {tick}, {time_s:.3f} s".format_map(held)
+    print_answer(held, [head, *format_fitted_records(held["levels"])], as_json)

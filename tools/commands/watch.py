@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from importlib.util import find_spec
@@ -20,8 +20,8 @@ from rack.tools.console.tables import create_console
 from rack.tools.monitor.polling import poll_run
 from rack.tools.monitor.signals import (
     SignalHistory,
-    SignalPrinter,
     SignalRows,
+    build_printer,
     format_value,
     show_plot,
 )
@@ -132,8 +132,7 @@ def _show_signals(
     span = round(PLOT_SPAN_S * 1e9 / segment.layout.clock_ns)
     strip = SignalHistory(segment, signals, span)
     first = segment.words[System.TICK]
-    printer = SignalPrinter(strip, first, round(every_s / strip.tick_s), as_json)
-    show_until: Callable[[int], None] = printer.show_until
+    show_until = build_printer(strip, first, round(every_s / strip.tick_s), as_json)
     terminal = create_console()
     with ExitStack() as stack:
         if terminal.is_terminal and not as_json:

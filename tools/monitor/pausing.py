@@ -7,38 +7,16 @@ an operator's hold stops its arm.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.console.answer import Failure
-from rack.tools.console.tables import format_fitted_records
+from rack.tools.console.answer import Document, Failure
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
 
 CHECK_INTERVAL_S = 0.001
 """Time between two checks of whether the rack is held."""
-
-
-@dataclass(frozen=True)
-class HeldRack:
-    """A rack that is held between two ticks.
-
-    Attributes:
-        levels: For each level its state, the row of its state table if it has one, and its reason.
-    """
-
-    rack: str
-    tick: int
-    time_s: float
-    levels: list[dict[str, str]]
-
-    def format_lines(self) -> Iterator[str]:
-        """Yield lines of text: the tick, and a table of the levels."""
-        yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
-        yield from format_fitted_records(self.levels)
 
 
 class Stepper:
@@ -92,8 +70,8 @@ class Stepper:
             raise Failure(f"--until {level}: no such level; valid levels: {known}", 2)
         return task.grid.find_tick(at) + (cycles - 1) * task.every + 1
 
-    def describe_rack(self) -> HeldRack:
-        """Describe the held rack: its tick, and the state of each level."""
+    def describe_rack(self) -> Document:
+        """Describe the held rack: its tick, and state, row of a table and reason of each level."""
         levels = [
             {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
             for row in RackMonitor(self._segment).take_snapshot().tasks
@@ -101,7 +79,7 @@ class Stepper:
         ]
         tick = self._words[System.HELD] - 1
         time_s = tick * self._segment.layout.clock_ns * 1e-9
-        return HeldRack(self._segment.rack, tick, time_s, levels)
+        return {"rack": self._segment.rack, "tick": tick, "time_s": time_s, "levels": levels}
 
     def _await_hold_at(self, tick: int) -> int:
         """Wait until the rack is held before `tick` or a later one, and return that tick."""

@@ -6,7 +6,7 @@ No message is missed, and no board is delayed.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,8 +118,10 @@ def format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-class SignalPrinter:
-    """Prints signals as lines of text or JSON.
+def build_printer(
+    history: SignalHistory, first: int, every: int, as_json: bool
+) -> Callable[[int], None]:
+    """Return a function that prints the new lines of signals up to a tick, as text or JSON.
 
     Args:
         history: History of the signals.
@@ -127,29 +129,23 @@ class SignalPrinter:
         every: Number of ticks between two lines. 0 for a line at each tick with a new message.
         as_json: True to print JSON documents.
     """
+    names = [signal.name for signal in history.signals]
+    following = first
 
-    def __init__(self, history: SignalHistory, first: int, every: int, as_json: bool) -> None:
-        self._history = history
-        self._next = first
-        self._every = max(every, 1)
-        self._as_json = as_json
-
-    def show_until(self, last: int) -> None:
+    def show_until(last: int) -> None:
         """Print the lines up to the tick `last` that have not been printed yet."""
-        for tick, values in self._history.list_rows(self._next, last):
-            if tick >= self._next:
-                self._print_line(tick, values)
-                self._next = tick + self._every
+        nonlocal following
+        for tick, values in history.list_rows(following, last):
+            if tick >= following:
+                following = tick + max(every, 1)
+                time_s = history.to_time_s(tick)
+                if as_json:
+                    line = {"time_s": time_s, "tick": tick, **dict(zip(names, values, strict=True))}
+                    print(encode_json(line), flush=True)
+                else:
+                    print(f"{time_s:10.4f}", *map(format_value, values), sep="  ", flush=True)
 
-    def _print_line(self, tick: int, values: Sequence[Any]) -> None:
-        """Print the values of all signals at a tick."""
-        time_s = self._history.to_time_s(tick)
-        if self._as_json:
-            names = [signal.name for signal in self._history.signals]
-            line = {"time_s": time_s, "tick": tick, **dict(zip(names, values, strict=True))}
-            print(encode_json(line), flush=True)
-        else:
-            print(f"{time_s:10.4f}", *map(format_value, values), sep="  ", flush=True)
+    return show_until
 
 
 def show_plot(history: SignalHistory, span: int, live: Live, last: int) -> None:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rack.tools.console.pictures import open_figure
-from rack.tools.plots.curves import Plot, SignalPanel, build_panels
-from rack.tools.plots.marks import Mark, group_marks
+from rack.tools.plots.curves import Mark, Plot, SignalPanel, build_panels, group_marks
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

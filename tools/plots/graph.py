@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -43,22 +43,19 @@ class BlockGraph(NamedTuple):
     rows: Mapping[str, int]
 
 
-def build_graphs(segment: Segment) -> list[BlockGraph]:
-    """Return the graph of each board of function blocks. Raises `Failure` if there is none."""
-    graphs = []
+def build_graph(segment: Segment) -> BlockGraph:
+    """Return the graph of the first board of function blocks. Raises `Failure` without one."""
     for wiring in resolve(load_text(segment.config)).tasks:
         if issubclass(find_class(wiring.target, object), BlockExecutor):
             network = build_network(wiring.context)
             reading = open_observer(segment, f"{wiring.task}.status").peek()
             if reading.has_message:
                 restore_network(network, reading.message)
-            graphs.append(_build_graph(wiring.task, network))
-    if not graphs:
-        raise Failure(f"--graph: no board of rack '{segment.rack}' consists of function blocks", 2)
-    return graphs
+            return _build_network_graph(wiring.task, network)
+    raise Failure(f"--graph: no board of rack '{segment.rack}' consists of function blocks", 2)
 
 
-def _build_graph(board: str, network: BlockNetwork) -> BlockGraph:
+def _build_network_graph(board: str, network: BlockNetwork) -> BlockGraph:
     """Return the graph of the blocks of a board, with the newest value of each."""
     nodes = {"stop": "stop"}
     for name, block in network.blocks.items():
@@ -81,13 +78,10 @@ def _build_graph(board: str, network: BlockNetwork) -> BlockGraph:
     return BlockGraph(board, nodes, edges, rows)
 
 
-def save_graphs(graphs: Sequence[BlockGraph], path: Path) -> None:
-    """Save graphs side by side, as PNG or SVG, depending on the suffix of the path."""
-    height = max(max(graph.rows.values()) for graph in graphs)
-    with open_figure([path], 6.5 * len(graphs), 1.4 * height + 1.6) as figure:
-        panels = figure.subplots(1, len(graphs), squeeze=False)[0]
-        for axes, graph in zip(panels, graphs, strict=True):
-            _draw_graph(axes, graph)
+def save_graph(graph: BlockGraph, path: Path) -> None:
+    """Save a graph, as PNG or SVG, depending on the suffix of the path."""
+    with open_figure([path], 6.5, 1.4 * max(graph.rows.values()) + 1.6) as figure:
+        _draw_graph(figure.add_subplot(), graph)
 
 
 def _draw_graph(axes: Axes, graph: BlockGraph) -> None:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rack.tools.plots.curves import Plot, Series, build_panels
-from rack.tools.plots.marks import group_marks
+from rack.tools.plots.curves import Plot, Series, build_panels, group_marks
 
 if TYPE_CHECKING:
     from rich.console import Console

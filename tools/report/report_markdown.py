@@ -24,9 +24,10 @@ FAULT_COLUMNS = (
     "is_recovered",
 )
 DROPPED = (
-    *("bound_cycles", "delay_cycles", "found_by", "mailbox", "joint", "reactions", "seen"),
+    *("found_by", "mailbox", "joint", "reactions", "seen", "bound_cycles", "delay_cycles"),
     *("superseded", "disordered", "repeated", "waiting", "source", "taken", "served", "depth"),
-    *("sum_eq_3_3_ms", "bound_eq_3_2_ms", "count", "took_ms", "started_ms"),
+    *("sum_eq_3_3_ms", "bound_eq_3_2_ms", "measured_ms p99", "unseen", "age_ms p99"),
+    *("count", "took_ms", "started_ms"),
 )
 """Columns that a narrow terminal leaves out, in this order."""
 CHANGED_RATIO = 1.05

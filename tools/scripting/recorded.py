@@ -13,8 +13,14 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.launch.continued import parse_tick
-from rack.tools.plots.curves import build_panels, format_index, split_values
-from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_marks
+from rack.tools.plots.curves import (
+    MAX_LEGEND_ENTRIES,
+    build_panels,
+    format_index,
+    group_marks,
+    list_marks,
+    split_values,
+)
 from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, find_mailbox, list_signals

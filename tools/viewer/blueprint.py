@@ -19,10 +19,13 @@ from rack.levels.systems.hand.messages import GraspStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
-from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find_floor_height
+from rack.tools.viewer.cell import CELL, FRAMES, compute_extent, find_floor_height
 from rack.tools.viewer.curves import (
+    AXES,
     BY_FINGER,
+    CONTACT_UNITS,
     ERROR,
+    FORCES,
     GRIPPER,
     HAND,
     JOINTS,
@@ -35,7 +38,6 @@ from rack.tools.viewer.curves import (
     has_curves,
 )
 from rack.tools.viewer.events import EVENTS, RACK_LANE
-from rack.tools.viewer.forces import AXES, CONTACT_UNITS, FORCES
 from rack.tools.viewer.levels import (
     HIERARCHY,
     LEVELS,
@@ -207,18 +209,14 @@ class RackViews:
         return _build_lane_columns(CYCLES, lanes, CYCLES_S)
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
-        """Return the 3D view of the cell with the title `name`. Collision shapes are hidden."""
+        """Return the 3D view of the cell with the title `name`."""
         # From the eye, arm and objects fill the view.
         centre, radius = compute_extent(cell)
         eye = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
         plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
         return rrb.Spatial3DView(
             origin=self.build_path(CELL),
-            contents=[
-                self.build_query(CELL),
-                f"- {self.build_query(CELL, COLLISION)}",
-                self.build_query(FRAMES),
-            ],
+            contents=[self.build_query(CELL), self.build_query(FRAMES)],
             name=name,
             eye_controls=rrb.EyeControls3D(
                 position=eye.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)

@@ -38,7 +38,6 @@ from rack.tools.viewer.stream import (
 from rack.tools.viewer.style import CURRENT, GOAL, LOST, PLANNED, pack_colours
 
 CELL = "cell"
-COLLISION = "collision"
 FRAMES = "frames"
 WORLD = "world"
 SHOWN_S = 0.02
@@ -124,13 +123,12 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
     if not is_shown.any():
         is_shown[:] = True
     arm = []
-    for geom in range(model.ngeom):
+    for geom in np.flatnonzero(is_shown).tolist():
         shape = build_shape(model, geom)
         if shape is not None:
             body = int(model.geom_bodyid[geom])
             name = model.geom(geom).name or f"geom {geom}"
-            group = (CELL,) if is_shown[geom] else (CELL, COLLISION)
-            entity = (*group, model.body(body).name or f"body {body}", name)
+            entity = (CELL, model.body(body).name or f"body {body}", name)
             if geom in cell.geoms.arm:
                 remove_colour(shape)
                 arm.append(ArmShape(entity, shape, read_colour(model, geom)))

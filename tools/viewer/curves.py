@@ -1,4 +1,4 @@
-"""Curves of an arm with set points and limits, of a hand, and of the numbers of any message."""
+"""Curves of an arm with set points and limits, of a hand, of forces, and of any message."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rack.levels.algebra import Array, Ints
 from rack.levels.messages import ArmState, Scene, WorldState
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
@@ -50,6 +51,11 @@ FINGER_FORCES = "forces"
 BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FINGER_FORCES: "N"}
 """Curves of a finger, and their units."""
 TIPS = (HAND, "tip_forces")
+FORCES = "forces"
+CONTACT_UNITS = {"force": "N", "torque": "N m"}
+"""Quantities of a contact, and their units."""
+AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
+"""Unit of each axis of a task frame."""
 
 
 def build_joint_curves(stream: Stream, names: Sequence[str], cell: Cell) -> Iterator[ViewPart]:
@@ -218,3 +224,23 @@ def _build_finger_curves(
         [f"{axis}, N" for axis in "xyz"],
         choose_joint_colours(3),
     )
+
+
+def build_task_force_curves(stream: Stream) -> Iterator[ViewPart]:
+    """Yield the view parts that show the forces and torques in a `ForceStatus`.
+
+    For each axis of the task frame there is a curve of the wanted value, and a curve of the value
+    that the tool exerts.
+    """
+    for index, (axis, colour) in enumerate(zip(AXES, choose_joint_colours(6), strict=True)):
+        names = [f"{axis} {what}, {AXES[axis]}" for what in ("wanted", "exerted")]
+        shades = [COMMANDED, colour]
+
+        def values(block: RowBlock, index: int = index) -> Array:
+            """Return both values. Nothing is wanted while position is controlled, not force."""
+            selected, wanted, wrench = (
+                block.messages[field][:, index] for field in ("selected", "wanted", "wrench")
+            )
+            return np.column_stack((np.where(selected == 1, wanted, np.nan), -wrench))
+
+        yield build_curves(stream, (FORCES, axis), values, names, shades, OVERLAID)

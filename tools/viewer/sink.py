@@ -39,9 +39,9 @@ from rack.tools.viewer.curves import (
     build_field_curves,
     build_hand_curves,
     build_joint_curves,
+    build_task_force_curves,
 )
 from rack.tools.viewer.events import EventWriter, build_loss_lines
-from rack.tools.viewer.forces import build_task_force_curves
 from rack.tools.viewer.levels import (
     FIRED,
     LEVELS,

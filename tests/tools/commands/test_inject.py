@@ -180,10 +180,10 @@ def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
     assert words[System.DEMAND] == Demand.NONE
 
 
-def test_the_help_lists_every_kind_with_its_means_bound_and_parameters() -> None:
-    shown = rack("inject", "--help").stdout
+def test_the_list_has_every_kind_with_its_means_bound_and_parameters() -> None:
+    shown = rack("inject", "--list").stdout
     lines = {tuple(line.split()[:2]): line for line in shown.splitlines()}
-    words = shown[shown.index("Kinds:") :].split()
+    words = shown.split()
     for kind in KINDS:
         # The columns of a table fold, so words of one cell may be lines apart.
         at = words.index(kind.name)

@@ -51,7 +51,7 @@ def test_a_held_rack_is_stepped_by_cycles_and_ticks(
     assert (
         given.stdout.replace("\n ", "") == f"command to 'counter', table slow: waits: {held_at}\n"
     )
-    tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
+    tick, level = stepped(rack_name, "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
@@ -74,7 +74,7 @@ def test_requests_to_a_held_rack_wait_until_it_continues(
     segment = Segment.attach(rack_name)
     fault = FaultTable(segment).entries[0]
     assert (fault.stage, segment.words[System.DEMAND]) == (Stage.WAITING, Demand.NONE)
-    assert stepped(rack_name, "--cycles", "2")[0] == 9
+    assert stepped(rack_name, "2")[0] == 9
     assert (fault.stage, segment.words[System.DEMAND]) == (Stage.ACTIVE, Demand.BRAKE)
     assert rack("estop", rack_name, "--reset").stdout.replace("\n ", "") == (
         f"rack '{rack_name}': emergency stop reset at tick 8; the arm"
@@ -109,9 +109,8 @@ def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[bytes], rack_
     [
         (
             ("--ticks", "1", "--until", "counter"),
-            "--ticks counts ticks, but N, --cycles and --until count cycles",
+            "--ticks counts ticks, but N and --until count cycles",
         ),
-        (("1", "--cycles", "1"), "N = 1: N and --cycles mean the same; give one of them"),
         (("--run", "--ticks", "1"), "--run lets the rack run without holding; leave out the steps"),
     ],
 )

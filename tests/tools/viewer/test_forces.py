@@ -13,7 +13,7 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Launch
 from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.systems.force.messages import ForceStatus
-from rack.tools.viewer.forces import build_task_force_curves
+from rack.tools.viewer.curves import build_task_force_curves
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, open_recording
 from tests.levels.systems.force.pad import pad

@@ -133,9 +133,7 @@ def test_the_blueprint_shows_only_existing_entities(run: Recording) -> None:
     assert len(queries) > 40
     for query in queries:
         entity = query.replace("\\", "").removeprefix("+").strip()
-        if not entity.startswith(
-            ("-", "/signals", "/cell/collision", "/events", "/missed", "/levels/5-world")
-        ):
+        if not entity.startswith(("-", "/signals", "/events", "/levels/5-world")):
             stem = entity.removesuffix("/**").replace("$origin", "/")
             assert any(
                 path == stem or path.startswith(stem.rstrip("/") + "/") for path in recorded
