@@ -288,8 +288,7 @@ def build_result(
         faults=list_strikes(segment, config.joints),
         clock_offset_ns=time.time_ns() - time.monotonic_ns(),
         refused={
-            queue["mailbox"]: queue["refused"]
-            for queue in list_queue_fills(NewestMessages(segment))
+            queue.mailbox: queue.refused for queue in list_queue_fills(NewestMessages(segment))
         },
     )
 

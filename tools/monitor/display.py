@@ -7,9 +7,9 @@ and the progress of the task. Elsewhere one line a second is printed, and nothin
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -198,15 +198,16 @@ class RackView:
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         if not has_space:
             yield from (Text(f"{name}: {why}", HOLD_STYLE) for name, why in reasons.items() if why)
-        sides = (snapshot.hosts, snapshot.entries, snapshot.peers)
-        for records in (*sides, snapshot.imports, snapshot.exports):
-            if records:
+        sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
+        for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
+            if records := [asdict(row) for row in rows]:
                 texts = [[_format_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
                 yield build_grid(
                     [key.replace("_", " ") for key in records[0]], texts, width, style=_choose_style
                 )
-        yield from map(Text, _list_buffers(snapshot))
+        yield from (Text(queue.line) for queue in snapshot.queues)
+        yield from (Text(inbox.line) for inbox in snapshot.inboxes)
         yield from (Text(_format_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
@@ -217,17 +218,6 @@ class RackView:
         if (at := snapshot.progress) is not None:
             actions = f"{at.actions_done}/{at.actions}"
             yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
-
-
-def _list_buffers(snapshot: Snapshot) -> Iterator[str]:
-    """Yield a line on each queue, and on each inbox of a board that messages interrupt."""
-    for queue in snapshot.queues:
-        more = ", {refused} refused" if queue["refused"] else ""
-        yield ("queue {mailbox}: {unread} of {capacity} unread" + more).format(**queue)
-    for inbox in snapshot.inboxes:
-        more = ", {lost} lost" if inbox["lost"] else ""
-        text = "interrupts of {board}: {served} served, at most {waiting} of {depth} waited"
-        yield (text + more).format(**inbox)
 
 
 def _format_cell(column: str, value: Any) -> str:

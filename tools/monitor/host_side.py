@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.checked import to_enum
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
-from rack.tools.console.answer import Document
 from rack.tools.monitor.newest_messages import NewestMessages
 
 ADAPTER_STATUS = "adapter_status"
@@ -21,11 +21,42 @@ AWAY = "away"
 DONE = "done"
 
 
-def list_host_rows(segment: Segment) -> list[Document]:
-    """Return the current state of every host board, and the number of messages that it has sent.
+@dataclass(frozen=True)
+class HostRow:
+    """Current state of a host board.
 
-    A board without a process has the pid 0.
+    Attributes:
+        pid: Process id. 0 without a process.
+        sent: Number of messages sent.
     """
+
+    board: str
+    pid: int
+    state: str
+    sent: int
+    restarts: int
+
+
+@dataclass(frozen=True)
+class EntryRow:
+    """An entry of a bus adapter, which passes messages to or from a host board, with its counts.
+
+    Attributes:
+        age_ms: Age of its newest message in ms of simulated time. None before the first message.
+    """
+
+    entry: str
+    source: str
+    passed: int
+    refused: int
+    superseded: int
+    full: int
+    waiting: int
+    age_ms: float | None
+
+
+def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
+    """Return the current state of every host board."""
     rows = []
     for host in segment.layout.hosts:
         block = segment.get_block(host.name)
@@ -34,16 +65,10 @@ def list_host_rows(segment: Segment) -> list[Document]:
         state = to_enum(TaskState, block[Block.STATE]).name.lower() if is_running else AWAY
         if block[Block.STATE] == TaskState.ENDED:
             state = DONE
-        rows.append(
-            {
-                "board": host.name,
-                "pid": block[Block.PID] if is_running else 0,
-                "state": state,
-                "sent": sum(head[Box.HEAD] for head in _list_heads(segment, host.name)),
-                "restarts": count_restarts(segment, host.name),
-            }
-        )
-    return rows
+        sent = sum(head[Box.HEAD] for head in _list_heads(segment, host.name))
+        pid = block[Block.PID] if is_running else 0
+        rows.append(HostRow(host.name, pid, state, sent, count_restarts(segment, host.name)))
+    return tuple(rows)
 
 
 def count_restarts(segment: Segment, writer: str) -> int:
@@ -59,22 +84,20 @@ def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
     return [segment.get_box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
-def list_entry_rows(newest: NewestMessages) -> list[Document]:
-    """Return the counts of each entry of the bus adapters that have reported a status.
-
-    `age_ms` is the age of its newest message in ms of simulated time. None before the first one.
-    """
-    rows: list[Document] = []
+def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
+    """Return the state of each entry of the bus adapters that have reported a status."""
+    rows: list[EntryRow] = []
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
     for mailbox, entry, source in list_entries(segment.layout, segment.config):
         if (status := newest.read_message(mailbox)) is not None:
             counts = getattr(status, entry)
-            numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
             age = int(counts["age"])
-            place = {"entry": f"{mailbox.partition('.')[0]}.{entry}", "source": source}
-            rows.append({**place, **numbers, "age_ms": None if age < 0 else age * tick_ms})
-    return rows
+            age_ms = None if age < 0 else age * tick_ms
+            numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
+            board = mailbox.partition(".")[0]
+            rows.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
+    return tuple(rows)
 
 
 def list_entries(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:

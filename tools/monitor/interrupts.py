@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,6 +22,33 @@ NEVER_SERVED = np.iinfo(np.int64).max
 """End of service of a message that was lost because the inbox was full."""
 
 
+@dataclass(frozen=True)
+class InboxFill:
+    """State of a board's inbox, with counts since the start of the run.
+
+    Attributes:
+        served: Number of messages that interrupted the board.
+        lost: Number of messages lost because the inbox was full.
+        waiting: Largest number of messages that waited at once.
+        depth: Capacity of the inbox.
+    """
+
+    board: str
+    served: int
+    lost: int
+    waiting: int
+    depth: int
+
+    @property
+    def line(self) -> str:
+        """Description of the inbox in one line."""
+        lost = f", {self.lost} lost" if self.lost else ""
+        return (
+            f"interrupts of {self.board}: {self.served} served, at most {self.waiting} of"
+            f" {self.depth} waited{lost}"
+        )
+
+
 def find_inbox_depths(layout: Layout) -> dict[int, int]:
     """Return a dictionary from slot to inbox depth, for each board that messages interrupt."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
@@ -32,26 +60,15 @@ def find_inbox_depths(layout: Layout) -> dict[int, int]:
     }
 
 
-def list_inbox_fills(segment: Segment) -> list[Document]:
-    """Return the state of the inbox of every board that messages interrupt.
-
-    The counts are since the start of the run: messages that interrupted the board, messages lost
-    because the inbox was full, and the largest number that waited at once.
-    """
+def list_inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
+    """Return the state of the inbox of every board that messages interrupt."""
     fills = []
     for slot, depth in find_inbox_depths(segment.layout).items():
         board = segment.layout.find_interrupt_task(slot)
         block = segment.get_block(board)
-        fills.append(
-            {
-                "board": board,
-                "served": block[Block.INTERRUPTS],
-                "lost": block[Block.INTERRUPTS_LOST],
-                "waiting": block[Block.INTERRUPTS_WAITING],
-                "depth": depth,
-            }
-        )
-    return fills
+        served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
+        fills.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
+    return tuple(fills)
 
 
 class Arrivals(NamedTuple):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.segment import Segment
 from rack.levels.peer import Presence, format_peer_port
-from rack.tools.console.answer import Document
 from rack.tools.monitor.newest_messages import NewestMessages
 
 ADAPTER = "lan"
@@ -25,6 +25,56 @@ COUNTS = (
     "superseded",
 )
 """Names of the counts of an import: see `rack.boards.lan.adapter.IMPORT`."""
+
+
+@dataclass(frozen=True)
+class PeerRow:
+    """Current state of another rack.
+
+    Attributes:
+        clock_ms: Its clock minus the clock of this rack. None if unknown, or in lockstep.
+        within_ms: Uncertainty of `clock_ms`.
+    """
+
+    peer: str
+    state: str
+    since_tick: int
+    launches: int
+    losses: int
+    clock_ms: float | None
+    within_ms: float | None
+
+
+@dataclass(frozen=True)
+class ImportRow:
+    """Current state of an import, with its counts.
+
+    Attributes:
+        age_ticks: Age of its information in ticks of this rack. None before the first message.
+        age_s: The same age in s of simulated time.
+    """
+
+    entry: str
+    source: str
+    taken: int
+    missing: int
+    disordered: int
+    repeated: int
+    late: int
+    refused: int
+    unknown_launch: int
+    superseded: int
+    age_ticks: int | None
+    age_s: float | None
+
+
+@dataclass(frozen=True)
+class ExportRow:
+    """Current state of an export."""
+
+    entry: str
+    source: str
+    sent: int
 
 
 class ExchangedEntries(NamedTuple):
@@ -58,62 +108,57 @@ def _find_entries(segment: Segment) -> ExchangedEntries:
     return (read_entries(segment.config) if has_adapter else None) or ExchangedEntries({}, {}, ())
 
 
-def list_peers(newest: NewestMessages) -> list[Document]:
-    """Return the state of each partner rack that the network adapter has reported.
+def list_peers(newest: NewestMessages) -> tuple[PeerRow, ...]:
+    """Return the state of each partner rack that the network adapter has reported."""
+    racks = _find_entries(newest.segment).peers
+    peers = ((rack, newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")) for rack in racks)
+    return tuple(_to_peer_row(rack, message) for rack, message in peers if message is not None)
 
-    `clock_ms` is its clock minus the clock of this rack, and `within_ms` the uncertainty. Both are
-    None if unknown, or in lockstep.
-    """
+
+def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
+    """Return the state of each import of a rack."""
     rows = []
-    for rack in _find_entries(newest.segment).peers:
-        message: Any = newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")
-        if message is not None:
-            is_known = message.uncertainty > 0.0
-            rows.append(
-                {
-                    "peer": rack,
-                    "state": Presence(message.presence).name.lower(),
-                    "since_tick": message.since,
-                    "launches": message.launches,
-                    "losses": message.losses,
-                    "clock_ms": message.offset * 1e3 if is_known else None,
-                    "within_ms": message.uncertainty * 1e3 if is_known else None,
-                }
-            )
-    return rows
-
-
-def list_imports(newest: NewestMessages) -> list[Document]:
-    """Return the counts of each import of a rack, and the age of its information.
-
-    The age is given in ticks of this rack, and in s of simulated time. None before the first
-    message.
-    """
-    rows = []
-    for row, counts in _list_counts(newest, "import"):
-        numbers = {name: int(counts[name]) for name in COUNTS}
+    for port, source, counts in _list_counts(
+        newest, "import", _find_entries(newest.segment).imports
+    ):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
-        rows.append({**row, **numbers, "age_ticks": ages[0], "age_s": ages[1]})
-    return rows
+        numbers = {name: int(counts[name]) for name in COUNTS}
+        entry = f"{ADAPTER}.{port}"
+        rows.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
+    return tuple(rows)
 
 
-def list_exports(newest: NewestMessages) -> list[Document]:
-    """Return the number of messages that each export of a rack has sent."""
-    return [{**row, "sent": int(counts["sent"])} for row, counts in _list_counts(newest, "export")]
+def list_exports(newest: NewestMessages) -> tuple[ExportRow, ...]:
+    """Return the state of each export of a rack."""
+    return tuple(
+        ExportRow(f"{ADAPTER}.{port}", source, int(counts["sent"]))
+        for port, source, counts in _list_counts(
+            newest, "export", _find_entries(newest.segment).exports
+        )
+    )
 
 
-def _list_counts(newest: NewestMessages, kind: str) -> Iterator[tuple[Document, Any]]:
-    """Yield name and source of each import or export, and its counts.
+def _list_counts(
+    newest: NewestMessages, kind: str, sources: Mapping[str, str]
+) -> Iterator[tuple[str, str, Any]]:
+    """Yield port, source and counts of each import or export.
 
     Yields nothing until the adapter has reported its first counts.
 
     Args:
         newest: Reads the status of the adapter.
         kind: "import" or "export".
+        sources: Dictionary from port to source.
     """
     if (status := newest.read_message(STATUS)) is not None:
-        sources = getattr(_find_entries(newest.segment), f"{kind}s")
         for port, source in sources.items():
-            row = {"entry": f"{ADAPTER}.{port}", "source": source}
-            yield row, getattr(status, f"{kind}_{port}")
+            yield port, source, getattr(status, f"{kind}_{port}")
+
+
+def _to_peer_row(rack: str, message: Any) -> PeerRow:
+    """Convert a message about another rack to a row."""
+    is_known = message.uncertainty > 0.0
+    clock = (message.offset * 1e3, message.uncertainty * 1e3) if is_known else (None, None)
+    state = Presence(message.presence).name.lower()
+    return PeerRow(rack, state, message.since, message.launches, message.losses, *clock)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,26 +16,38 @@ if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
 
-def list_queue_fills(newest: NewestMessages) -> list[Document]:
-    """Return the current state of every queue of a rack.
+@dataclass(frozen=True)
+class QueueFill:
+    """Current state of a queue.
 
-    `unread` is the number of messages in it, and `refused` that of the messages refused so far
-    because the queue was full.
+    Attributes:
+        unread: Number of messages in the queue.
+        capacity: Maximum number of messages.
+        refused: Number of messages refused so far because the queue was full.
     """
+
+    mailbox: str
+    unread: int
+    capacity: int
+    refused: int
+
+    @property
+    def line(self) -> str:
+        """Description of the queue in one line."""
+        refused = f", {self.refused} refused" if self.refused else ""
+        return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
+
+
+def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
+    """Return the current state of every queue of a rack."""
     fills = []
     for box in list_queues(newest.segment.layout):
         # Read the reader's position first: messages taken after this still count as unread.
         position = newest.read_message(get_position_mailbox(box.name))
         words = newest.segment.get_box(box.name)
-        fills.append(
-            {
-                "mailbox": box.name,
-                "unread": words[Box.SENT] - (0 if position is None else position.taken),
-                "capacity": box.capacity,
-                "refused": words[Box.REFUSED],
-            }
-        )
-    return fills
+        unread = words[Box.SENT] - (0 if position is None else position.taken)
+        fills.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
+    return tuple(fills)
 
 
 def summarize_queues(recording: Recording) -> list[Document]:

@@ -18,13 +18,25 @@ from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block, Demand, Run, Scheduler, System, TaskState
 from rack.boards.exchange import EXCHANGE_PORT, PortAge, list_port_ages
 from rack.boards.timing.trace_times import compute_execution_ns, compute_lateness_ns
-from rack.tools.console.answer import Document
 from rack.tools.monitor.holds import Hold, find_holds
-from rack.tools.monitor.host_side import count_restarts, list_entry_rows, list_host_rows
-from rack.tools.monitor.interrupts import list_inbox_fills
-from rack.tools.monitor.network import list_exports, list_imports, list_peers
+from rack.tools.monitor.host_side import (
+    EntryRow,
+    HostRow,
+    count_restarts,
+    list_entry_rows,
+    list_host_rows,
+)
+from rack.tools.monitor.interrupts import InboxFill, list_inbox_fills
+from rack.tools.monitor.network import (
+    ExportRow,
+    ImportRow,
+    PeerRow,
+    list_exports,
+    list_imports,
+    list_peers,
+)
 from rack.tools.monitor.newest_messages import NewestMessages
-from rack.tools.monitor.queues import list_queue_fills
+from rack.tools.monitor.queues import QueueFill, list_queue_fills
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -115,14 +127,14 @@ class Snapshot:
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
     holds: tuple[Hold, ...]
-    hosts: list[Document]
-    entries: list[Document]
-    queues: list[Document]
-    inboxes: list[Document]
+    hosts: tuple[HostRow, ...]
+    entries: tuple[EntryRow, ...]
+    queues: tuple[QueueFill, ...]
+    inboxes: tuple[InboxFill, ...]
     exchanges: Mapping[str, Mapping[str, PortAge]]
-    peers: list[Document]
-    imports: list[Document]
-    exports: list[Document]
+    peers: tuple[PeerRow, ...]
+    imports: tuple[ImportRow, ...]
+    exports: tuple[ExportRow, ...]
 
 
 class RackMonitor:

@@ -16,7 +16,7 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink_segment
 from rack.boards import Rack
 from rack.boards.config import load, resolve_layout
-from rack.tools.monitor.host_side import list_entry_rows
+from rack.tools.monitor.host_side import EntryRow, list_entry_rows
 from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
@@ -50,7 +50,7 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
     segment = Segment.create(layout, config.to_toml_text())
     try:
         newest = NewestMessages(segment)
-        assert list_entry_rows(newest) == []
+        assert list_entry_rows(newest) == ()
         writer = open_writer(segment, "bridge.status")
         for entry, counts in (
             ("numbers", {"passed": 7, "refused": 2, "age": 4}),
@@ -61,10 +61,10 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
         writer.write(0)
         writer.close()
         age_ms = 4 * layout.clock_ns * 1e-6
-        assert [[*row.values()] for row in list_entry_rows(newest)] == [
-            ["bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms],
-            ["bridge.sum", "adder.status", 0, 0, 3, 5, 1, None],
-        ]
+        assert list_entry_rows(newest) == (
+            EntryRow("bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms),
+            EntryRow("bridge.sum", "adder.status", 0, 0, 3, 5, 1, None),
+        )
     finally:
         segment.close()
         unlink_segment(rack_name)

@@ -18,6 +18,9 @@ from rack.boards.config.resolved import resolve_layout
 from rack.levels.peer import Presence
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.network import (
+    ExportRow,
+    ImportRow,
+    PeerRow,
     list_exports,
     list_imports,
     list_peers,
@@ -62,12 +65,14 @@ def segment(rack_name: str) -> Iterator[Segment]:
 
 
 def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:
-    (found,) = list_peers(NewestMessages(segment))
-    assert [*found.values()] == ["other-one", "lost", 400, 2, 1, -500.0, 0.2]
-    taken = {"entry": "lan.other", "source": "other-one/pulse.status", **COUNTS}
-    assert list_imports(NewestMessages(segment)) == [taken | {"age_ticks": 16, "age_s": 0.04}]
-    sent = {"entry": "lan.pulse", "source": "pulse.status", "sent": 12}
-    assert list_exports(NewestMessages(segment)) == [sent]
+    assert list_peers(NewestMessages(segment)) == (
+        PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),
+    )
+    taken = ImportRow(
+        "lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04
+    )
+    assert list_imports(NewestMessages(segment)) == (taken,)
+    assert list_exports(NewestMessages(segment)) == (ExportRow("lan.pulse", "pulse.status", 12),)
     terminal = Console(width=200, record=True, file=StringIO())
     terminal.print(RackView(RackMonitor(segment).take_snapshot()))
     text = terminal.export_text()

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from rack.boards import Rack
 from rack.boards.config import load, resolve_layout
 from rack.tools.console.tables import render_text
 from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display, RackView
-from rack.tools.monitor.snapshot import RackMonitor
+from rack.tools.monitor.display import Display
+from rack.tools.monitor.newest_messages import NewestMessages
+from rack.tools.monitor.queues import list_queue_fills
 from rack.tools.report.report import write_report
 from rack.tools.timing.inventory import build_inventory, format_inventory
 from tests.boards.test_queues import QUEUES
@@ -37,16 +36,11 @@ def test_status_check_and_report_show_fill_and_refusals_of_a_queue(
     )
     assert " queue 7 upper lower " in " ".join(line.split())
     with Rack(config) as rack:
-        terminal = Console(width=200, record=True, file=StringIO())
-        monitor = RackMonitor(rack.segment)
-        terminal.print(RackView(monitor.take_snapshot()))
+        (empty,) = list_queue_fills(NewestMessages(rack.segment))
+        assert empty.line == "queue upper.requests: 0 of 7 unread"
         rack.run(1.0)
-        terminal.print(RackView(monitor.take_snapshot()))
-    lines = [line for line in terminal.export_text().splitlines() if line.startswith("queue ")]
-    assert lines == [
-        "queue upper.requests: 0 of 7 unread",
-        "queue upper.requests: 5 of 7 unread, 19 refused",
-    ]
+        (full,) = list_queue_fills(NewestMessages(rack.segment))
+    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
     result = run_rack(config, 2.0, tmp_path / "run", Display())
     report, text = write_report(tmp_path / "run")
     (queue,) = report["queues"]
