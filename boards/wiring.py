@@ -87,7 +87,7 @@ class Continuation:
 
 @dataclass(frozen=True)
 class Scheduling:
-    """How the executor of a board competes for its core.
+    """Scheduler of a board's executor, and what it needs.
 
     Attributes:
         core: The core that the config requests.

@@ -18,8 +18,9 @@ from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.connections import find_executors
 from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
+from rack.boards.config.schedulers import list_reservation_mistakes, list_valid_schedulers
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.config.timing import compute_first_tick, list_reservation_mistakes
+from rack.boards.config.timing import compute_first_tick
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError
@@ -255,8 +256,9 @@ def _check_setting(
 
 def _check_scheduler(place: str, command: CommandConfig, config: RackConfig) -> Mistakes:
     """Check that a command `schedule` names a scheduler that the board can have."""
-    if command.name not in config.valid_schedulers:
-        why = f"no scheduler in this clock mode; valid: {', '.join(config.valid_schedulers)}"
+    valid = list_valid_schedulers(config)
+    if command.name not in valid:
+        why = f"no scheduler in this clock mode; valid: {', '.join(valid)}"
         yield Mistake(place, command.name, why)
     elif command.name == Scheduler.EARLIEST_DEADLINE_FIRST.word:
         yield from list_reservation_mistakes(config, command.level, place)

@@ -19,6 +19,7 @@ from rack.backplane.errors import ClockError
 from rack.backplane.layout import Protocol
 from rack.backplane.message import Message
 from rack.backplane.message_type import MessageType
+from rack.boards.config.schedulers import names_scheduler
 from rack.boards.config.schema import (
     LAN,
     ExchangeConfig,
@@ -262,7 +263,7 @@ class Wiring:
     def operator_mailboxes(self) -> list[str]:
         """Mailboxes through which an operator commands levels."""
         classes = find_executors(self.config).items()
-        is_any = self.config.names_schedulers
+        is_any = names_scheduler(self.config)
         return [f"{board}.operator" for board, kind in classes if is_any or has_operator_port(kind)]
 
     @cached_property

@@ -18,6 +18,7 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
 from rack.boards.config.connections import find_executors, has_operator_port
+from rack.boards.config.schedulers import list_valid_schedulers, names_scheduler
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.kind import KINDS, Kind
 from rack.boards.faults.kinds import BUILT_IN
@@ -135,9 +136,9 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
             launched = read_params(kind.params, params)
         live = {key: PublishedParam(str(getattr(launched, key, ""))) for key in keys}
     wording = {Operation.SET: tuple(live)}
-    if config.names_schedulers:
+    if names_scheduler(config):
         commands[Operation.SCHEDULE] = ()
-        wording[Operation.SCHEDULE] = config.valid_schedulers
+        wording[Operation.SCHEDULE] = list_valid_schedulers(config)
     for what in commands.keys() & {*NAMED_OPERATIONS} - wording.keys():
         # A state table may be invalid while it is being edited.
         with suppress(LevelError):

@@ -22,8 +22,9 @@ from rack.boards.config.layout import RETAINED_S, LayoutBuilder, build_exchanges
 from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
+from rack.boards.config.schedulers import build_scheduling, compute_clock_reservation
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
-from rack.boards.config.timing import build_scheduling, compute_clock_reservation, is_critical
+from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
-from rack.backplane.words import Scheduler
 from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
@@ -122,9 +121,8 @@ class TimingConfig(Table):
     clock_ms: Milliseconds = 0.0
     """processor time that the system clock's board needs per tick [ms]"""
     lockstep_load: float = Field(0.0, ge=0, le=1000)
-    """in lockstep, computing time of each cycle as a multiple of its budget, on simulated cores
-    under the boards' schedulers, which the config must name; 0: computing takes no simulated
-    time"""
+    """in lockstep, each cycle takes this multiple of its budget as simulated time, on cores under
+    the boards' schedulers, which the config must name; with 0 computing takes no simulated time"""
     small_share: float = Field(0.1, gt=0, le=1)
     """largest fraction of a cycle that counts as much smaller than the cycle (eq. 3.10)"""
 
@@ -493,22 +491,6 @@ class RackConfig(Table):
     def format_notes(self) -> list[str]:
         """Notes on changes since this config's format. Empty if the format is the newest."""
         return [FORMAT_NOTE] if self.format < FORMAT else []
-
-    @property
-    def names_schedulers(self) -> bool:
-        """Whether the config names a scheduler, so that an operator may change it."""
-        return bool(self.clock.scheduler) or any(board.scheduler for board in self.board.values())
-
-    @property
-    def valid_schedulers(self) -> tuple[str, ...]:
-        """Names of the schedulers that boards may have in this clock mode."""
-        # Linux has no scheduler by urgency.
-        return get_args(SchedulerName)[: 3 if self.is_lockstep else 2]
-
-    def find_scheduler(self, board: str) -> Scheduler:
-        """Return the scheduler of a board's executor at the launch."""
-        word = self.board[board].scheduler or self.clock.scheduler or "fixed-priority"
-        return Scheduler.find(word)
 
     @property
     def is_lockstep(self) -> bool:

@@ -8,30 +8,19 @@ from dataclasses import asdict, fields, replace
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.interrupt import get_interrupt_spec, list_sources
-from rack.backplane.process import Reservation
-from rack.backplane.words import Scheduler
-from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.schema import (
     BudgetConfig,
     CommandConfig,
     RackConfig,
     ScheduleConfig,
 )
-from rack.boards.errors import Mistake, Mistakes
 from rack.boards.faults.config import FaultConfig
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming
 from rack.boards.timing.rack import CyclicSchedule, RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
-from rack.boards.wiring import Scheduling
 
 NS_PER_MS = 1e6
-RESERVED_BUDGETS = 2
-"""Factor between a board's budget and the processor time that it reserves per cycle.
-
-A budget is a 99th percentile, and the kernel suspends a task that exceeds its reservation until its
-next cycle.
-"""
 KEYS = {part.name: part.name.replace("_ns", "_ms") for part in fields(Budget)}
 """Key in a config for each field of a `Budget`."""
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
@@ -156,76 +145,6 @@ def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
             if exchange.task == board:
                 grids[box.writer] = max(grids.get(box.writer, exchange.grid), exchange.grid)
     return grids
-
-
-def build_scheduling(config: RackConfig, board: str, every: int) -> Scheduling | None:
-    """Return how the executor of a board is scheduled. None if the config names no scheduler.
-
-    Args:
-        config: The config of the rack.
-        board: The board.
-        every: Period of the board in ticks.
-    """
-    table = config.board[board]
-    load = config.timing.lockstep_load if config.is_lockstep else 0.0
-    if not config.names_schedulers:
-        return None
-    is_with_clock = table.core == config.clock.core
-    return Scheduling(
-        table.core,
-        config.find_scheduler(board),
-        is_critical=table.critical,
-        cost_ns=round(load * table.busy_ms * NS_PER_MS),
-        reservation=_compute_reservation(config, table.busy_ms, every),
-        clocks=_compute_reservation(config, config.timing.clock_ms, 1) if is_with_clock else None,
-    )
-
-
-def compute_clock_reservation(config: RackConfig) -> Reservation | None:
-    """Return the processor time that the clock reserves at the launch.
-
-    None if no board on its core does. Otherwise the clock would run below that board.
-    """
-    names = [name for name, board in config.board.items() if board.core == config.clock.core]
-    if Scheduler.EARLIEST_DEADLINE_FIRST not in map(config.find_scheduler, names):
-        return None
-    return _compute_reservation(config, config.timing.clock_ms, 1)
-
-
-def _compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
-    """Return the processor time to reserve per period. None without a budget, or in lockstep.
-
-    Args:
-        config: The config of the rack.
-        busy_ms: Budgeted processor time of one cycle in ms.
-        every: Period of the task in ticks.
-    """
-    if config.is_lockstep or not busy_ms:
-        return None
-    period_ns = every * config.tick_ns
-    return Reservation(min(round(RESERVED_BUDGETS * busy_ms * NS_PER_MS), period_ns), period_ns)
-
-
-def list_reservation_mistakes(config: RackConfig, name: str, key: str) -> Mistakes:
-    """Yield why a board cannot reserve processor time, as earliest deadline first requires.
-
-    Args:
-        config: The config of the rack.
-        name: The board.
-        key: Key that chooses the scheduler.
-    """
-    board = config.board[name]
-    place = f"board.{name}"
-    if not board.busy_ms:
-        yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
-    if (board.wake or config.clock.wake) == "poll":
-        yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
-    if board.coupling == "tight":
-        why = "a planner with the executor's priority would run below all reservations"
-        yield Mistake(f"{place}.coupling", "tight", why)
-    if board.executor == LAN_ADAPTER:
-        why = "the network adapter's threads need its priority; use fixed-priority"
-        yield Mistake(key, Scheduler.EARLIEST_DEADLINE_FIRST.word, why)
 
 
 def compute_first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:

@@ -15,6 +15,12 @@ from rack.backplane.words import Scheduler
 from rack.boards.config.connections import Wiring
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import report_repeated_names
+from rack.boards.config.schedulers import (
+    find_scheduler,
+    list_reservation_mistakes,
+    list_valid_schedulers,
+    names_scheduler,
+)
 from rack.boards.config.schema import (
     LAN,
     LONGEST_EVERY,
@@ -22,7 +28,7 @@ from rack.boards.config.schema import (
     BoardConfig,
     ScheduleConfig,
 )
-from rack.boards.config.timing import PLANNER_BUDGET, compute_frames, list_reservation_mistakes
+from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
@@ -227,14 +233,14 @@ def check_schedulers(wiring: Wiring) -> Mistakes:
     config = wiring.config
     reported = set[str]()
     load = config.timing.lockstep_load if config.is_lockstep else 0.0
-    if load and not config.names_schedulers:
+    if load and not names_scheduler(config):
         yield Mistake("timing.lockstep_load", load, "needs clock.scheduler, which is missing")
     for name, board in config.board.items():
-        scheduler = config.find_scheduler(name)
+        scheduler = find_scheduler(config, name)
         key = "clock.scheduler" if board.scheduler is None else f"board.{name}.scheduler"
-        if scheduler.word not in config.valid_schedulers and key not in reported:
+        if scheduler.word not in list_valid_schedulers(config) and key not in reported:
             reported.add(key)
-            valid = " or ".join(config.valid_schedulers)
+            valid = " or ".join(list_valid_schedulers(config))
             why = f"Linux has no such scheduler; in real time use {valid}"
             yield Mistake(key, scheduler.word, why)
         if scheduler is Scheduler.EARLIEST_DEADLINE_FIRST:

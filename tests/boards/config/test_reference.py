@@ -26,6 +26,7 @@ DIMENSIONLESS = {
     *(
         "speed",
         "small_share",
+        "lockstep_load",
         "max_missed_fraction",
         "phase",
         "damping",

@@ -53,6 +53,7 @@ KINDS = {
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
     Alarm.REMOTE_STOP: "command",
+    Alarm.SCHEDULER_KEPT: "command",
     Alarm.PEER_BACK: "recovery",
     Alarm.PEER_RESTARTED: "recovery",
     Alarm.LATCHED: "reaction",
@@ -119,6 +120,14 @@ def test_a_finding_that_a_level_declares_has_its_name_value_and_unit(
         3.25,
         text,
     )
+
+
+def test_a_refused_scheduler_is_reported_of_its_board_with_the_reason(segment: Segment) -> None:
+    event = heard(segment, "clock", Alarm.SCHEDULER_KEPT, 0, 2.0, text="not permitted")
+    board = segment.layout.tasks[0].name
+    assert (event.board, event.subject) == (board, board)
+    refused = "earliest-deadline-first refused: not permitted"
+    assert event.text == f"'{board}' goes on as before: {refused}"
 
 
 @pytest.mark.parametrize(("owner", "number"), [("wave", 2), ("watch", 0)])

@@ -52,6 +52,7 @@ def wiring(**changed: object) -> ClockWiring:
         "restart_ticks": 20,
         "on_loss": {"left": Demand.STOP, "right": Demand.BRAKE},
         "reservation": None,
+        "schedulings": {},
     }
     return ClockWiring(**{**plain, **changed})  # type: ignore[arg-type]  # by name, as above
 

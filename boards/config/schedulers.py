@@ -1,0 +1,107 @@
+"""Schedulers of a config: the scheduler of each board, and the processor time that it reserves."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from rack.backplane.process import Reservation
+from rack.backplane.words import Scheduler
+from rack.boards.config.files import LAN_ADAPTER
+from rack.boards.config.schema import RackConfig, SchedulerName
+from rack.boards.errors import Mistake, Mistakes
+from rack.boards.wiring import Scheduling
+
+NS_PER_MS = 1e6
+RESERVED_BUDGETS = 2
+"""Factor between a board's budget and the processor time that it reserves per cycle.
+
+A budget is a 99th percentile, and the kernel suspends a task that exceeds its reservation until its
+next cycle.
+"""
+
+
+def names_scheduler(config: RackConfig) -> bool:
+    """Return True if a config names a scheduler, so that an operator may change it."""
+    return bool(config.clock.scheduler) or any(b.scheduler for b in config.board.values())
+
+
+def list_valid_schedulers(config: RackConfig) -> tuple[str, ...]:
+    """Return the names of the schedulers that boards may have in the clock mode of a config."""
+    # Linux has no scheduler by urgency.
+    return get_args(SchedulerName)[: 3 if config.is_lockstep else 2]
+
+
+def find_scheduler(config: RackConfig, board: str) -> Scheduler:
+    """Return the scheduler of a board's executor at the launch."""
+    word = config.board[board].scheduler or config.clock.scheduler or "fixed-priority"
+    return Scheduler.find(word)
+
+
+def build_scheduling(config: RackConfig, board: str, every: int) -> Scheduling | None:
+    """Return how the executor of a board is scheduled. None if the config names no scheduler.
+
+    Args:
+        config: The config of the rack.
+        board: The board.
+        every: Period of the board in ticks.
+    """
+    table = config.board[board]
+    load = config.timing.lockstep_load if config.is_lockstep else 0.0
+    if not names_scheduler(config):
+        return None
+    is_with_clock = table.core == config.clock.core
+    return Scheduling(
+        table.core,
+        find_scheduler(config, board),
+        is_critical=table.critical,
+        cost_ns=round(load * table.busy_ms * NS_PER_MS),
+        reservation=_compute_reservation(config, table.busy_ms, every),
+        clocks=_compute_reservation(config, config.timing.clock_ms, 1) if is_with_clock else None,
+    )
+
+
+def compute_clock_reservation(config: RackConfig) -> Reservation | None:
+    """Return the processor time that the clock reserves at the launch.
+
+    None if no board on its core does. Otherwise the clock would run below that board.
+    """
+    names = [name for name, board in config.board.items() if board.core == config.clock.core]
+    if Scheduler.EARLIEST_DEADLINE_FIRST not in [find_scheduler(config, name) for name in names]:
+        return None
+    return _compute_reservation(config, config.timing.clock_ms, 1)
+
+
+def _compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
+    """Return the processor time to reserve per period. None without a budget, or in lockstep.
+
+    Args:
+        config: The config of the rack.
+        busy_ms: Budgeted processor time of one cycle in ms.
+        every: Period of the task in ticks.
+    """
+    if config.is_lockstep or not busy_ms:
+        return None
+    period_ns = every * config.tick_ns
+    return Reservation(min(round(RESERVED_BUDGETS * busy_ms * NS_PER_MS), period_ns), period_ns)
+
+
+def list_reservation_mistakes(config: RackConfig, name: str, key: str) -> Mistakes:
+    """Yield why a board cannot reserve processor time, as earliest deadline first requires.
+
+    Args:
+        config: The config of the rack.
+        name: The board.
+        key: Key that chooses the scheduler.
+    """
+    board = config.board[name]
+    place = f"board.{name}"
+    if not board.busy_ms:
+        yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
+    if (board.wake or config.clock.wake) == "poll":
+        yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
+    if board.coupling == "tight":
+        why = "a planner with the executor's priority would run below all reservations"
+        yield Mistake(f"{place}.coupling", "tight", why)
+    if board.executor == LAN_ADAPTER:
+        why = "the network adapter's threads need its priority; use fixed-priority"
+        yield Mistake(key, Scheduler.EARLIEST_DEADLINE_FIRST.word, why)
