@@ -300,6 +300,8 @@ class LevelSection:
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
+        # In lockstep, time in s by which the clock is late for this cycle, set by the board.
+        self.late_s = 0.0
         self.ports: dict[str, Any] = {}
         """Readings and messages of the ports that a config creates, by name."""
         if self.params is not None:
@@ -399,8 +401,6 @@ class Executor(LevelSection, ABC):
         # when the active faults change.
         # Kind of stop that the rack demands of the arm in this cycle, for safety.
         self.demand = Demand.NONE
-        # In lockstep, time in s by which the clock is late for this cycle.
-        self.late_s = 0.0
         # Faults detected in this cycle, once per episode. The board raises alarms for them.
         self.findings: list[Finding] = []
         # The injected faults that had an effect in this cycle, by index. The value is True if the

@@ -52,15 +52,12 @@ class ClockStep:
         during: Called in each tick while it is active.
         end: Called when it ends.
         is_void: Returns True if the affected process is gone, so that the fault ends early.
-        lateness: Returns by how many ticks a tick begins late, from the fault and the tick. None if
-            ticks are not late.
     """
 
     begin: Strike = _do_nothing
     during: Strike = _do_nothing
     end: Strike = _do_nothing
     is_void: Callable[[FaultStage, FaultEntry], bool] = lambda rack, entry: False
-    lateness: Callable[[FaultEntry, int], float] | None = None
 
 
 def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
@@ -128,7 +125,7 @@ def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     stage.driver.count_skipped(tick, stage.driver.skip)
 
 
-def _draw_lateness(entry: FaultEntry, tick: int) -> float:
+def draw_lateness(entry: FaultEntry, tick: int) -> float:
     """Return the lateness of a tick, between the fault's parameters."""
     most, least, *_ = entry.parameters
     return random.Random(entry.seed + tick).uniform(min(least, most), most)
@@ -136,7 +133,7 @@ def _draw_lateness(entry: FaultEntry, tick: int) -> float:
 
 def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Delay a tick by a random part of its period. In lockstep, each task computes its lateness."""
-    delay = _draw_lateness(entry, tick)
+    delay = draw_lateness(entry, tick)
     entry.record_action(tick, delay > REPORTED_TICKS)
     if stage.clock.is_lockstep:
         return
@@ -150,7 +147,7 @@ HANG = ClockStep(_stop_process, end=_continue_process, is_void=_is_process_lost)
 MASQUERADE = ClockStep(_forge_message)
 CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip_ticks)
-CLOCK_JITTER = ClockStep(during=_delay_tick, lateness=_draw_lateness)
+CLOCK_JITTER = ClockStep(during=_delay_tick)
 ELSEWHERE = ClockStep()
 """Steps of a fault that acts in another process: the clock's board does nothing."""
 

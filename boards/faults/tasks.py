@@ -16,7 +16,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.process import pin_to_core
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.faults.clock_board import ClockStep
+from rack.boards.faults.clock_board import CLOCK_JITTER, draw_lateness
 from rack.boards.faults.kind import find_kind
 from rack.levels.fault_steps import Fault
 
@@ -30,30 +30,19 @@ MAX_POLL_S = 0.05
 
 
 @dataclass(frozen=True)
-class SimulatedClock:
-    """Simulated time since tick 0, with the methods of `SystemClock` that load steps use."""
-
-    period_ns: int
-
-    def compute_time_ns(self, tick: int) -> int:
-        """Return the time of a tick in ns."""
-        return tick * self.period_ns
-
-
-@dataclass(frozen=True)
 class ExtraComputing:
     """Extra computing time in a task's cycle.
 
     Attributes:
         entry: The fault.
         spec: The affected task.
-        clock: Clock on which the computing takes time.
+        clock: System clock of the rack.
         until: Step of the kind, which computes when the extra computing ends.
     """
 
     entry: FaultEntry
     spec: TaskSpec
-    clock: SystemClock | SimulatedClock
+    clock: SystemClock
     until: LoadStep
 
     def burn_time(self, tick: int) -> None:
@@ -72,7 +61,7 @@ class ExtraComputing:
 LoadStep = Callable[[ExtraComputing, int, int], int]
 """Computes the time at which extra computing ends from the load, the tick and the current time.
 
-Times are CLOCK_MONOTONIC in ns, in lockstep simulated ns since tick 0.
+Times are CLOCK_MONOTONIC in ns, in lockstep as if ticks had their length in real time.
 """
 
 
@@ -134,8 +123,7 @@ class TaskFaults:
         self._index = segment.layout.processes.index(spec)
         self._apply = apply
         self._level = level
-        clock = SystemClock(segment)
-        self._clock = SimulatedClock(segment.layout.clock_ns) if clock.is_lockstep else clock
+        self._clock = SystemClock(segment)
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
         self.taken_until = 0
@@ -152,7 +140,7 @@ class TaskFaults:
         """
         generation = self._table.generation
         entries = self._table.list_entries((Stage.ACTIVE,))
-        if isinstance(self._clock, SimulatedClock):
+        if self._clock.is_lockstep:
             self._refresh_simulated_faults(entries, tick)
         begun = [(find_kind(entry), entry) for entry in entries if entry.task == self._index]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
@@ -185,21 +173,16 @@ class TaskFaults:
                     self.taken_until = max(self.taken_until, entry.until)
                     if struck is spec:
                         entry.record_action(tick)
-            elif isinstance(kind.step, ClockStep) and kind.step.lateness is not None:
+            elif kind.step is CLOCK_JITTER:
                 self._late_ticks.append(entry)
 
     def find_lateness(self, tick: int) -> float:
         """In lockstep, return by how many ticks the clock begins `tick` late."""
-        late = [
-            step.lateness(entry, tick)
-            for entry in self._late_ticks
-            if isinstance(step := find_kind(entry).step, ClockStep) and step.lateness is not None
-        ]
-        return max(late, default=0.0)
+        return max((draw_lateness(entry, tick) for entry in self._late_ticks), default=0.0)
 
     def burn_time(self, tick: int) -> None:
         """In real time, keep the processor busy for each active fault in turn."""
-        if isinstance(self._clock, SystemClock):
+        if not self._clock.is_lockstep:
             for load in self.loads:
                 load.burn_time(tick)
 
@@ -213,9 +196,10 @@ class TaskFaults:
             begin_ns: Begin of the cycle.
             end_ns: End of the cycle without the faults.
         """
+        epoch_ns = self._clock.compute_time_ns(0)
         for load in self.loads:
             load.entry.record_action(tick)
-            end_ns = load.until(load, tick, end_ns)
+            end_ns = load.until(load, tick, epoch_ns + end_ns) - epoch_ns
         return end_ns
 
     def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:

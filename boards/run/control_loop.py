@@ -93,11 +93,6 @@ class VirtualControlLoop(Task):
         in_time = in_time and (ended is None or ended < deadline)
         watch.finish_cycle(in_time, deadline, done=tick)
 
-    def set_lateness(self, ticks: float) -> None:
-        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
-        super().set_lateness(ticks)
-        self.executor.late_s = ticks * self.simulated.clock_ns * 1e-9
-
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
 

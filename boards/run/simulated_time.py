@@ -11,7 +11,7 @@ step before and returns a later one, or the same. The cycle then waits for the t
 before it writes, if that tick is not before its deadline or if readers see a message as soon as it
 is written. A cycle cannot begin before the end of the one before it.
 
-All times are simulated ns since tick 0, where a tick has the length `Layout.clock_ns`.
+All times are simulated ns since tick 0. A tick is as long as in real time (`System.PERIOD_NS`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from collections.abc import Callable
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
+from rack.backplane.words import System
 
 FinishStep = Callable[[int, int, int], int]
 """Computes the end of a cycle from its release tick, its begin, and its end up to now.
@@ -41,12 +42,13 @@ class SimulatedTime:
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
-        layout = segment.layout
-        self.clock_ns = layout.clock_ns
+        self.clock_ns = segment.words[System.PERIOD_NS]
         self.steps: list[FinishStep] = []
         self.late_ns = self.begin_ns = self.end_ns = 0
         self._shows_at_once = not all(
-            mailbox.is_repeatable for mailbox in layout.mailboxes if mailbox.writer == spec.name
+            mailbox.is_repeatable
+            for mailbox in segment.layout.mailboxes
+            if mailbox.writer == spec.name
         )
 
     def insert_step(self, step: FinishStep, is_active: bool) -> None:

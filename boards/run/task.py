@@ -49,6 +49,7 @@ class Task(ABC):
         self.spec = spec = segment.layout.find_task(wiring.task)
         self.block = segment.get_block(wiring.task)
         self.words = segment.words
+        self._level = level
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(
@@ -95,17 +96,15 @@ class Task(ABC):
             if faults.taken_until <= tick:
                 if self.clock.is_lockstep:
                     self.simulated.insert_step(faults.extend_computing, bool(faults.loads))
-                    self.set_lateness(faults.find_lateness(tick))
+                    late_ticks = faults.find_lateness(tick)
+                    late_ns = int(late_ticks * self.clock.period_ns)
+                    self.simulated.late_ns = self.stopwatch.late_ns = late_ns
+                    self._level.late_s = late_ticks * self._level.context.tick_s
                 return tick
             # The core is taken: the task gets its newest release once the core is free again.
             self.next_cycle.return_release(tick)
             self.next_cycle.wait_for_tick(faults.taken_until)
         return None
-
-    def set_lateness(self, ticks: float) -> None:
-        """In lockstep, set by how many ticks the clock is late for the cycle that begins."""
-        self.simulated.late_ns = int(ticks * self.simulated.clock_ns)
-        self.stopwatch.late_ns = int(ticks * self.clock.period_ns)
 
     def end_computing(self, tick: int, deadline: int) -> int | None:
         """In lockstep, wait until the clock has begun the tick in which the computing ends.

@@ -139,7 +139,7 @@ def format_times(report: RunReport) -> Blocks:
     if is_lockstep:
         yield (
             "In lockstep a tick lasts as long as its tasks take, so there are no deadlines, no"
-            " lateness and no residuals."
+            " lateness and no residuals, except in cycles that take simulated time."
         )
         yield ""
     for name, (traced, ran) in report.untraced.items():

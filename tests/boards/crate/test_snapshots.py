@@ -99,6 +99,31 @@ def test_a_run_continues_from_each_snapshot_to_the_same_digest(
         assert (again.digest, again.ticks) == (expected.digest, expected.ticks), tick
 
 
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"kind": "overrun", "board": "wave", "by": 2.5},
+        {"kind": "overrun", "board": "watch", "by": 2.5},
+        {"kind": "planner-slow", "board": "wave.planner", "by": 3.0},
+        {"kind": "hog", "board": "wave"},
+        {"kind": "clock-jitter", "board": "clock"},
+    ],
+    ids=lambda fault: f"{fault['kind']} of {fault['board']}",
+)
+def test_a_run_continues_from_the_middle_of_a_cycle_that_takes_simulated_time(
+    config: MakeConfig, crate: WarmCrate, fault: dict[str, Any]
+) -> None:
+    rack = faulty(config(), {"tick": 100, "cycles": 6, **fault})
+    with Rack(rack) as plain:
+        expected = plain.run(SECONDS)
+        assert any(event.kind == "miss" for event in plain.events)
+    ticks = (0, 101, 102, 103, 105, 109)
+    assert taken_at(rack, crate, *ticks).digest == expected.digest
+    assert ticks_on(crate) == [*ticks]
+    for tick in ticks[::-1]:
+        assert continued(rack, crate, tick).digest == expected.digest, tick
+
+
 @pytest.mark.parametrize("level", ["Rememberer", "Holder"])
 def test_a_snapshot_contains_the_whole_state_of_a_level(
     config: MakeConfig, crate: WarmCrate, level: str

@@ -137,3 +137,49 @@ def test_a_task_that_is_late_at_the_end_of_the_run_ends(config: MakeConfig) -> N
     ticks = found.written.cycles["wave"]["tick"]
     assert ticks[ticks >= FIRST].tolist() == [FIRST, 99]
     assert found.blocks["wave"][0] == 2
+
+
+@pytest.mark.slow
+def test_a_hog_stops_the_tasks_of_its_core_up_to_its_priority(config: MakeConfig) -> None:
+    priorities = ("board.wave.priority=50", "board.wave.planner_priority=20", "board.watch.core=0")
+    found = run(config, *priorities, kind="hog", board="wave", cycles=6)
+    # The release at the end of the fault is the next that they take.
+    assert found.cycle("wave", FIRST + 6) == (Flag.SKIPPED, 6)
+    assert found.blocks["wave"][:2] == [0, 6]
+    assert found.ticks("late", "wave") == [FIRST + 1]
+    assert found.ticks("starved", "wave") == [FIRST + 4]
+    assert found.ticks("plan_late", "wave.planner") == [FIRST + 1]
+    assert found.blocks["watch"][:2] == [0, 0]
+    lower = run(config, *priorities, kind="hog", board="wave.planner", cycles=2)
+    assert lower.blocks["wave"][:2] == [0, 0]
+    assert lower.ticks("starved", "wave.planner") == [FIRST + 4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("late", "alarms"), [(0.9, [FIRST]), (0.4, [])])
+def test_late_ticks_are_found_by_the_fastest_task(
+    config: MakeConfig, late: float, alarms: list[int]
+) -> None:
+    found = run(config, kind="clock-jitter", board="clock", late=late, least=late, **{"for": 0.05})
+    assert [event.tick for event in found.events if event.code == "clock_late"] == alarms
+    assert all(event.board == "wave" for event in found.events if event.code == "clock_late")
+    rows = found.written.cycles["wave"]
+    is_late = (rows["tick"] >= FIRST) & (rows["tick"] < FIRST + 20)
+    lateness = rows["start_ns"] - rows["release_ns"]
+    assert lateness[is_late].tolist() == [round(late * 2_500_000)] * 20
+    assert not lateness[~is_late].any()
+    assert found.blocks["wave"][:2] == [0, 0]
+
+
+@pytest.mark.slow
+def test_lateness_of_a_tick_adds_to_the_computing(config: MakeConfig) -> None:
+    # Late by 0.6 and computing for 0.5 ticks, a cycle misses its deadline.
+    with Rack(
+        faulty(
+            config(),
+            {"kind": "clock-jitter", "board": "clock", "late": 0.6, "least": 0.6},
+            {"kind": "overrun", "board": "wave", "tick": FIRST, "cycles": 1, "by": 0.5},
+        )
+    ) as rack:
+        rack.run(SECONDS)
+        assert rack.segment.get_block("wave")[Block.MISSED] == 1
