@@ -60,7 +60,7 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
 ) -> None:
     with rack_with(config, kind, length) as rack:
         layout = rack.segment.layout
-        outcome = rack.run(2.0)
+        outcome = rack.run(3.0)
         (entry,) = FaultTable(rack.segment).list_entries((Stage.ACTIVE, Stage.OVER))
         board = layout.tasks[entry.task].name if entry.task >= 0 else CLOCK
         rows = open_trace_ring(rack.segment, "watch").read_new_rows().rows

@@ -45,7 +45,9 @@ SCRIPTS = {
     "[[fault]]\nkind = 'kill'\nboard = 'servo'": (
         'fault[0].board = "servo": no such task; tasks: upper, lower'
     ),
-    "[[fault]]\nkind = 'hog'\nboard = 'lower'": 'fault[0].kind = "hog": hog needs real time',
+    "[[fault]]\nkind = 'clock-stop'\nboard = 'clock'": (
+        'fault[0].kind = "clock-stop": clock-stop needs real time'
+    ),
     "[[fault]\n": "script.toml: not TOML: ",
     "[run]\n": "script.toml: run: a fault script contains [[fault]] tables and nothing else",
 }

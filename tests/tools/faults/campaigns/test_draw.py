@@ -144,9 +144,9 @@ def _lasts(table: Mapping[str, Any]) -> int:
         ("kill,murder", False, "--kinds murder: there is no such kind; valid kinds: kill, hang, "),
         ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; valid kinds: "),
         (
-            "hog",
+            "clock-stop",
             True,
-            "--kinds hog: hog needs real time, and the campaign is in lockstep; valid kinds: ",
+            "--kinds clock-stop: clock-stop needs real time, and the campaign is in lockstep; ",
         ),
         (" , ", False, "--kinds names no kind; valid kinds: "),
     ],

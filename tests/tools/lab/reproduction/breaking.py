@@ -37,7 +37,8 @@ class BreakingWorkshop(Workshop):
     def find_source(self, name: str) -> str:
         """Return the path of a changed config, or the changed text of a chain.
 
-        Changes that a chain cannot take are left out: a second protocol, or an overrun in lockstep.
+        Changes that a chain cannot take are left out: a second protocol. An overrun changes only
+        the chains in real time, where its cycles are counted.
         """
         if "\n" in name:
             changes = self._changes.get(CHAIN, "")

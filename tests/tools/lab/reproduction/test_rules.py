@@ -29,6 +29,7 @@ from rack.tools.lab.reproduction.experiments.partition import (
     TaskFigures,
 )
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
+from rack.tools.lab.reproduction.experiments.smoothness import MotionPoint, SmoothnessRun
 from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
 from rack.tools.lab.reproduction.experiments.switch import SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import (
@@ -210,7 +211,31 @@ def whole_tasks(longest_ms: float, unexplained: int, ended: str = TASK_DONE) -> 
     return [RUN, tables("pick"), *runs]
 
 
+def moved(value: float, error_mrad: float, jerk: float, brakings: int) -> MotionPoint:
+    """Return the motion at a point of a sweep."""
+    return MotionPoint(value, 0.1 * value, error_mrad, jerk, brakings, 5.0)
+
+
+STILL = moved(0.0, 0.3, 60.0, 0)
+SMOOTH = SmoothnessRun(
+    STILL,
+    jitter=(moved(0.05, 0.4, 66.0, 0), moved(0.4, 0.7, 360.0, 5)),
+    overrun=(replace(STILL, value=0.95), moved(2.0, 0.3, 80.0, 0), moved(4.0, 3.2, 340.0, 0)),
+    rate=(moved(100.0, 0.28, 75.0, 0), moved(50.0, 12.0, 15000.0, 1)),
+)
 RULINGS = [
+    ("smooth-motion", [SMOOTH], HOLDS),
+    ("smooth-motion", [replace(SMOOTH, jitter=SMOOTH.jitter[::-1])], FAILS),
+    ("smooth-motion", [replace(SMOOTH, jitter=(STILL, STILL))], FAILS),
+    ("smooth-motion", [replace(SMOOTH, rate=(STILL, STILL))], FAILS),
+    (
+        "smooth-motion",
+        [replace(SMOOTH, overrun=(moved(0.95, 0.31, 60.0, 0), *SMOOTH.overrun[1:]))],
+        FAILS,
+    ),
+    ("smooth-motion", [replace(SMOOTH, jitter=(moved(0.05, 0.4, 66.0, 0),) * 2)], FAILS),
+    ("smooth-motion", [replace(SMOOTH, overrun=SMOOTH.overrun[1:])], Ruling.UNTESTABLE),
+    ("smooth-motion", [replace(SMOOTH, undisturbed=moved(0, 0.3, 60.0, 1))], Ruling.UNTESTABLE),
     ("determinism", [determined(EQUAL)], HOLDS),
     ("determinism", [determined(compared("realtime", "b", 4, 5), EQUAL)], HOLDS),
     ("determinism", [determined(compared("realtime", "b", 4, 5))], BOUNDED),
