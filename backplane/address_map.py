@@ -79,18 +79,16 @@ class AddressMap:
     def describe_owner(self, address: int) -> str:
         """Return a description of what contains an address on the bus, with its writer."""
         places = {
-            0: "the words of the Rack and the system clock",
-            self.faults: "the fault table",
-            self.operator: "the operator table",
-            **{at: f"the alarms of '{name}'" for name, at in self.alarms.items()},
-            **{at: f"the control block of '{name}'" for name, at in self.blocks.items()},
-            **{at: f"the trace of '{name}'" for name, at in self.traces.items()},
+            0: "the words of the Rack, the system clock and its tables",
+            **{
+                at: f"the control block of '{name}' and its rings"
+                for name, at in self.blocks.items()
+            },
             **{
                 at: f"mailbox '{name}', whose messages have checksums and one writer"
                 for name, at in self.mailboxes.items()
             },
-            **dict.fromkeys((*self.wake.values(), *self.done.values()), "a semaphore"),
-            **{at: f"the lock of '{name}'" for name, at in self.locks.items()},
+            **dict.fromkeys(self.wake.values(), "semaphores and locks"),
             **{at: f"the scratch words of '{name}'" for name, at in self.scratch.items()},
         }
         return places[max(start for start in places if start <= address)]

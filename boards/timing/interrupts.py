@@ -15,8 +15,8 @@ from rack.backplane.mailbox.inbox import (
     compute_burst,
 )
 
-MAX_ARRIVALS = 20_000
-"""Largest number of messages that are simulated, until their arrivals repeat."""
+MAX_EVENTS = 20_000
+"""Largest number of messages and computations that are simulated, until they repeat."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,11 @@ class InboxTiming:
         """
         if not time_ns:
             return 0
-        whole_ns = lcm(self.period_ns, *(source.every_ns for source in self.sources))
+        periods_ns = [self.period_ns, *(source.every_ns for source in self.sources)]
+        whole_ns = lcm(*periods_ns)
         longest_ns = MAX_PREEMPTED_CYCLES * self.period_ns
-        events = sum(whole_ns // each.every_ns for each in self.sources)
-        if events > MAX_ARRIVALS or not all(source.is_periodic for source in self.sources):
+        count = sum(whole_ns // period_ns for period_ns in periods_ns)
+        if count > MAX_EVENTS or not all(source.is_periodic for source in self.sources):
             return self._bound_cost_ns(time_ns, longest_ns)
         # After the latest first message, everything repeats.
         settled_ns = max(self.first_ns, *(source.at_ns for source in self.sources)) + whole_ns

@@ -217,7 +217,7 @@ class HostWords(Message, version=1):
     word: ndarray = field(
         "i8",
         unit="1",
-        doc="scratch words; 0: force in mN that is added to the grip force, the others are free",
+        doc="scratch words; the first is a force in mN that is added to the grip force",
         shape=8,
     )
 

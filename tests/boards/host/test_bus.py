@@ -131,18 +131,25 @@ def test_a_program_writes_scratch_words_of_its_board_alone(
         ("a", 1, "'a': addresses and counts must be integers"),
         (bus.scratch, 1.5, "1.5: must be a whole number from -2^63 to 2^63 - 1"),
         (bus.scratch, 1 << 63, "9223372036854775808: must be a whole number"),
-        (WORD * System.TICK, 1, "belongs to the words of the Rack and the system clock;"),
-        (bus.address("adder"), 1, "belongs to the control block of 'adder'; 'program' may write"),
+        (
+            WORD * System.TICK,
+            1,
+            "belongs to the words of the Rack, the system clock and its tables;",
+        ),
+        (
+            bus.address("adder"),
+            1,
+            "the control block of 'adder' and its rings; 'program' may write",
+        ),
         (
             bus.address("adder.status"),
             1,
             "to mailbox 'adder.status', whose messages have checksums",
         ),
-        (places.operator, 1, "belongs to the operator table"),
-        (places.alarms["clock"], 1, "belongs to the alarms of 'clock'"),
-        (places.traces["adder"] + WORD, 1, "belongs to the trace of 'adder'"),
-        (places.wake["adder"], 1, "belongs to a semaphore"),
-        (bus.scratch - WORD, 1, "belongs to a semaphore"),
+        (places.operator, 1, "the system clock and its tables"),
+        (places.traces["adder"] + WORD, 1, "the control block of 'adder' and its rings"),
+        (places.wake["adder"], 1, "belongs to semaphores and locks"),
+        (bus.scratch - WORD, 1, "belongs to semaphores and locks"),
     ):
         with pytest.raises(ValueError, match=re.escape(why)) as error:
             bus.write(address, value)  # type: ignore[arg-type]

@@ -142,9 +142,12 @@ def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -
 
 
 def test_interrupts_that_never_end_are_described_in_a_sentence() -> None:
-    inbox = InboxTiming("low", ("up.status",), (InterruptSource(1_000, 2_000),), 4)
-    timing = replace(JudgedConfig.judge(load("fig2")).timing, inboxes={"low": inbox})
+    source = InterruptSource(1_000, 2_000)
+    inbox = InboxTiming("low", ("up.status",), (source,), 4, 1_000, 0, 1_000)
+    timing = JudgedConfig.judge(load("fig2")).timing
+    board = next(iter(timing.boards))
+    timing = replace(timing, inboxes={board: replace(inbox, task=board)})
     (found,) = [verdict for verdict in evaluate_rack(timing) if verdict.equation == INBOX]
     assert list(find_tightest([found])) == [
-        "tightest: interrupts of 'low' come faster than it serves them (load 2)"
+        "tightest: interrupts of 'level' come faster than it serves them (load 2)"
     ]
