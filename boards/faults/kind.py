@@ -281,6 +281,9 @@ class Kinds:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
     def __getitem__(self, key: str | int) -> Kind:
         """Return the kind with a name, or with a number in the fault table.
 

@@ -18,7 +18,7 @@ from typing import Any
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import estop_key, out_key
-from rack.boards.lan.link import LanLink
+from rack.boards.lan.link import MAX_UNREAD, LanLink
 
 HEAD = Envelope(1, 2, 3, 4, 5, 6, 7)
 PERIOD_S = 0.005
@@ -36,7 +36,7 @@ class Home:
         self._arrived = [
             link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()
         ]
-        self._questions = link.open_questions(estop_key("*", rack))
+        self._questions = link.open_questions(estop_key("*", rack), MAX_UNREAD)
         self._exports = [
             (key, link.publish(key))
             for key in (out_key(rack, e.source) for e in table.exports.values())
@@ -56,7 +56,7 @@ class Home:
                 self._good[key] += not isinstance(sealer.open_message(key, envelope, payload), Flaw)
         for asked, reply in self._questions():
             self._asked[asked.key] += 1
-            reply(b"answer", sealer.seal(asked.key, HEAD, b"answer"))
+            reply(b"answer", attachment=sealer.seal(asked.key, HEAD, b"answer"))
         for key, put in self._exports:
             put(b"content", sealer.seal(key, HEAD, b"content"))
         self._tokens += [

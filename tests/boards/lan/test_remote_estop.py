@@ -63,8 +63,9 @@ class Line:
 
     def put(self, asker: str, envelope: bytes | None, payload: bytes = b"") -> None:
 
-        def reply(payload: bytes, envelope: bytes) -> None:
-            head = self.sealer.open_message(estop_answer_key(self.rack, asker), envelope, payload)
+        def reply(payload: bytes, attachment: bytes) -> None:
+            key = estop_answer_key(self.rack, asker)
+            head = self.sealer.open_message(key, attachment, payload)
             assert isinstance(head, Envelope)
             assert payload == b""
             self.answers.append(head)

@@ -137,7 +137,7 @@ def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
     wanted = "board.notes.exchange={ below = { asynchronous = true } }"
     with pytest.raises(
         ConfigError,
-        match=r"^board.notes.exchange.below.asynchronous = true: 'wave.status' is a queue",
+        match=r"^board.notes.exchange.below.asynchronous = true: 'wave.status' has protocol queue",
     ):
         resolve(config(*QUEUE[:2], wanted, text=NO_TABLE))
 
