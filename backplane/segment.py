@@ -10,12 +10,15 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import stat
 import time
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
+
+import posix_ipc
 
 from rack.backplane.address_map import (
     BLOCK_SIZE,
@@ -254,24 +257,25 @@ class Segment:
             SegmentError: There is no such segment, it belongs to another user, or it is not a
                 segment.
         """
-        path = get_shm_path(rack)
+        if (kind := find_foreign_kind(rack)) is not None:
+            raise SegmentError(f"rack '{rack}': {get_shm_path(rack)} is a {kind}, not a segment")
         try:
-            fd = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
-        except (OSError, ValueError) as error:
-            why = "does not exist"
-            if isinstance(error, PermissionError):
-                why = "belongs to another user"
-            elif os.path.lexists(path):
-                why = f"has no segment: {error}"
+            shm = posix_ipc.SharedMemory(_shm_name(rack))
+        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
+            why = (
+                "belongs to another user"
+                if isinstance(error, posix_ipc.PermissionsError)
+                else "does not exist"
+            )
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(list_racks()) or 'none'}"
             ) from None
-        status = os.fstat(fd)
+        status = os.fstat(shm.fd)
         if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
-            os.close(fd)
+            os.close(shm.fd)
             why = f"owner {status.st_uid}, {status.st_size} bytes: not a segment of this user"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(fd, status.st_size), fd)
+        return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
 
     def read_head(self) -> None:
         """Read layout, config and published facts from the segment.
@@ -417,6 +421,20 @@ def list_racks() -> list[str]:
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
+def find_foreign_kind(rack: str) -> str | None:
+    """Return the kind of an entry in /dev/shm that has a rack's name but is not a segment.
+
+    Returns:
+        The kind, such as "directory". None if the entry is a regular file or does not exist.
+    """
+    try:
+        mode = get_shm_path(rack).lstat().st_mode
+    except OSError:  # no such file, or an impossible name
+        return None
+    kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
+    return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
+
+
 def unlink_segment(rack: str) -> None:
     """Remove a rack's segment by name. Does nothing if the segment does not exist.
 
@@ -424,8 +442,10 @@ def unlink_segment(rack: str) -> None:
         SegmentError: The segment belongs to another user.
     """
     try:
-        get_shm_path(rack).unlink(missing_ok=True)
-    except PermissionError:
+        posix_ipc.unlink_shared_memory(_shm_name(rack))
+    except posix_ipc.ExistentialError:
+        return
+    except posix_ipc.PermissionsError:
         raise SegmentError(
             f"rack '{rack}' belongs to another user: only that user may remove it"
         ) from None
@@ -439,6 +459,11 @@ def get_shm_path(rack: str) -> Path:
 def _pid_namespace() -> int:
     """Return the inode of this process's PID namespace, which identifies the namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
+
+
+def _shm_name(rack: str) -> str:
+    """Return the name of a rack's segment as `posix_ipc` expects it, with a leading slash."""
+    return f"/{PREFIX}{rack}"
 
 
 def restore_layout(plain: dict[str, Any]) -> Layout:

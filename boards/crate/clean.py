@@ -11,6 +11,7 @@ from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
 from rack.backplane.segment import (
     Segment,
+    find_foreign_kind,
     get_shm_path,
     list_racks,
     unlink_segment,
@@ -33,8 +34,7 @@ def remove_dead_rack(rack: str) -> bool:
     with suppress(FileNotFoundError):
         # A file that is too short for a head is not in use, because a launch names its segment only
         # when the segment is complete.
-        path = get_shm_path(rack)
-        if path.is_file() and not path.is_symlink() and path.stat().st_size < HEAD_SIZE:
+        if find_foreign_kind(rack) is None and get_shm_path(rack).stat().st_size < HEAD_SIZE:
             unlink_segment(rack)
             return True
     try:

@@ -179,19 +179,14 @@ def test_one_of_several_launches_takes_and_keeps_a_dead_racks_name(
         start.close()
 
 
-@pytest.mark.parametrize(
-    ("kind", "reason"),
-    [("directory", "Is a directory"), ("link", "Too many levels of symbolic links")],
-)
-def test_a_foreign_entry_is_named_and_left_alone(
-    rack_name: str, tmp_path: Path, kind: str, reason: str
-) -> None:
+@pytest.mark.parametrize("kind", ["directory", "symbolic link"])
+def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
     place, target = get_shm_path(rack_name), tmp_path / "target"
     target.write_bytes(bytes(8192))
     place.mkdir() if kind == "directory" else place.symlink_to(target)
-    why = f"rack '{rack_name}' has no segment: "
+    why = f"rack '{rack_name}': {place} is a {kind}, not a segment"
     try:
-        assert any(why in text and reason in text for text in remove_dead_racks()[2])
+        assert why in remove_dead_racks()[2]
         with pytest.raises(SegmentError, match=re.escape(why)):
             remove_dead_rack(rack_name)
         with pytest.raises(SegmentError, match=re.escape(why)):
