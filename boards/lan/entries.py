@@ -353,5 +353,5 @@ class Import:
         count = self.count
         count.launch = NO_LAUNCH if self._grid.is_lockstep else self._order.launch
         count.age = NEVER if self._basis is None else tick - self._basis
-        count.age_s = NEVER if count.age == NEVER else count.age * self._grid.clock_ns * 1e-9
+        count.age_s = NEVER if count.age == NEVER else count.age * (self._grid.clock_ns * 1e-9)
         fill_counts(record, count.record.item())
