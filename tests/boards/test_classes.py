@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config.loader import extend_path, find_class
+from rack.boards.config.loader import extend_path
 from rack.levels.level import Executor, Planner
+from rack.levels.references import find_class
 from rack.levels.servo import ServoExecutor
 
 

@@ -73,7 +73,9 @@ def test_a_table_with_a_hole_is_refused_with_its_state_and_case(
     assert (
         str(caught.value)
         == "board.counter.params.tables.saw = \"saw.toml\": hole: no row of 'down' takes count ="
-        " low, late = yes, new = no"
+        " low, late = yes, command = none|unknown, new = no\nboard.counter.params.tables.saw ="
+        " \"saw.toml\": hole: no row of 'down' takes count = low, late = yes, command = reset,"
+        " new = no"
     )
 
 

@@ -170,7 +170,7 @@ def _launched(name: str, command: Sequence[str]) -> Iterator[None]:
 def guarded(spied: Spied, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
     """The levels, where an import would find them even without the config's path."""
     monkeypatch.syspath_prepend(str(spied.marker.parent))
-    monkeypatch.setattr(KINDS, "_by_name", dict(KINDS._by_name))
+    monkeypatch.setattr(KINDS, "names", dict(KINDS.names))
     monkeypatch.setattr(KINDS, "_by_number", dict(KINDS._by_number))
     before = list(sys.path)
     yield spied
@@ -222,7 +222,7 @@ def test_a_report_made_again_knows_kinds_that_levels_add(guarded: Spied) -> None
             (True, "published.json: damaged"),
             (False, "unknown kind 'spy-drop'"),
         ):
-            kind = KINDS._by_name.pop("spy-drop", None)
+            kind = KINDS.names.pop("spy-drop", None)
             KINDS._by_number.pop(kind.number if kind else 0, None)
             published.unlink()
             if is_there:

@@ -165,7 +165,8 @@ class Hierarchy:
 
     Higher levels are drawn above lower levels, and boards outside the hierarchy to their left.
     Edges lead from each level to the levels below it, and from each planner to its board. Changes
-    of state are collected until `write_changes` writes them.
+    of state are collected until `write_changes` writes them. A planner's trace record comes only at
+    the end of its plan, so changes are written when that time has passed.
     """
 
     def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
@@ -175,6 +176,7 @@ class Hierarchy:
         self._shown = dict(self._states)  # the states that the graph shows
         self._positions = compute_positions(layout, rack)
         self._changes: list[tuple[Moment, str, str]] = []
+        self._longest_slice = max(task.slice for task in layout.tasks)
         downward = [(upper, board.name) for board in rack.boards.values() for upper in board.above]
         plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
         stream.log_static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
@@ -194,12 +196,16 @@ class Hierarchy:
         self._changes.append((when, task, state))
         self._states[task] = state
 
-    def write_changes(self) -> None:
-        """Write the collected changes of state, earliest first."""
-        for when, task, state in sorted(self._changes):
+    def write_changes(self, tick: float) -> None:
+        """Write the changes of state that precede any whose records may come after `tick`.
+
+        They are written earliest first. Infinity writes all collected changes.
+        """
+        self._changes.sort()
+        while self._changes and self._changes[0][0].tick < tick - self._longest_slice:
+            when, task, state = self._changes.pop(0)
             self._shown[task] = state
             self._write_graph(when)
-        self._changes.clear()
 
     def _write_graph(self, when: Moment) -> None:
         """Write the graph with the current colours."""

@@ -213,13 +213,13 @@ class RackWriter:
         for age in self._ages.values():
             age.write_ages(tick)
         self._events.write_events(tick)
-        self._hierarchy.write_changes()
+        self._hierarchy.write_changes(tick)
         self._write_losses(tick, lost)
 
     def write_last_events(self) -> None:
         """Write the remaining events, after all rows have been written."""
         self._events.write_events(math.inf)
-        self._hierarchy.write_changes()
+        self._hierarchy.write_changes(math.inf)
 
     def skip_to(self, tick: int) -> None:
         """Continue at `tick` after a range of ticks that was not recorded."""

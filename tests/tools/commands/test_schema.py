@@ -18,13 +18,14 @@ def test_without_a_table_it_lists_the_tables(small: Path) -> None:
 def test_each_key_of_a_table_has_unit_range_default_and_meaning(small: Path) -> None:
     title, head, *lines = rack("schema", "clock", "--config", small).stdout.splitlines()
     assert title.startswith("[clock]: ")
-    # A pipe has no space for the type.
-    assert head.split() == ["key", "unit", "permitted", "default", "meaning"]
+    assert head.split() == ["key", "unit", "type", "permitted", "default", "meaning"]
     (line,) = (line for line in lines if line.startswith("period_ms"))
-    assert " ".join(line.split()).startswith("period_ms ms 0.01 to 1000 required tick period; ")
+    assert " ".join(line.split()).startswith(
+        "period_ms ms number 0.01 to 1000 required tick period; "
+    )
     (table,) = json.loads(rack("schema", "clock", "--json", "--config", small).stdout)
     assert table["heading"] == "[clock]"
-    assert {"name", "type", *head.split()[1:]} == set(table["keys"][0])
+    assert {"name", *head.split()[1:]} == set(table["keys"][0])
 
 
 def test_an_unknown_table_ends_with_status_2_and_one_line(small: Path) -> None:
