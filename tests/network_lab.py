@@ -22,7 +22,6 @@ from typing import Any, Self
 
 from rack.backplane.process import wait_readable
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import run_program
 
 PREFIX = "rack-lab"
 NAMESPACES = Path("/run/netns")
@@ -167,7 +166,10 @@ def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     """Run a command with these lines as its input, and return what it prints. Raises `Failure`."""
     called = f"network lab: {' '.join(argv)}"
     text = "".join(f"{line}\n" for line in lines)
-    done = run_program(called, argv, PATIENCE_S, input_text=text)
+    try:
+        done = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=PATIENCE_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise Failure(f"{called}: {error}") from None
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
         raise Failure(f"{called}: {why}")
