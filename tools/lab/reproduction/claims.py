@@ -119,7 +119,7 @@ SECTIONS = (
                 "... and flexibility for testing alternative control strategies via different"
                 " partitioning.",
                 "The same task was done along the same path in every partition.",
-                (partition.PARTITION,),
+                (partition.TASKS,),
                 rules.judge_flexibility,
             ),
             PaperClaim(

@@ -18,10 +18,16 @@ from rack.tools.recording.recording import Recording
 from rack.tools.report.analysis import compute_core_loads
 from rack.tools.report.arm_outcome import DRIVING, find_signals
 
-NAME = "nasrem-three-poses"
-"""NASREM's rack with a short task, for which every level makes plans."""
-SECONDS = 15.0
-"""Time of a run, s. The task takes 11 s, and longer on a slow machine."""
+NAME = "nasrem"
+SECONDS = 12.0
+"""Time of a run, s.
+
+In lockstep, every level has made a plan after half of this time. On one processor it takes longer.
+"""
+TASK = "nasrem-three-poses"
+TASK_S = 11.0
+MAX_TASK_S = 25.0
+"""Expected and longest time of a task that is done in every partition, s."""
 LAUNCH_S = 3.0
 COMPARED_CYCLES = 8
 """Cycles of the arm from one compared point of its path to the next."""
@@ -102,12 +108,22 @@ class PartitionFigures:
 
 
 def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
-    """Run the whole task in every partition."""
-    config = workshop.load_config(NAME)
+    """Run NASREM in every partition, as far as in `SECONDS`."""
+    return _run_partitions(workshop, NAME, SECONDS)
+
+
+def _measure_tasks(workshop: Workshop) -> tuple[PartitionFigures, ...]:
+    """Run a whole task in every partition."""
+    return _run_partitions(workshop, TASK, MAX_TASK_S)
+
+
+def _run_partitions(workshop: Workshop, name: str, seconds: float) -> tuple[PartitionFigures, ...]:
+    """Run a rack in every partition, for at most `seconds`."""
+    config = workshop.load_config(name)
     # Check all configs before the first rack runs.
     racks = [partition.apply_to(config) for partition in PARTITIONS]
     runs = [
-        workshop.run(f"partition-{partition.coupling}-{partition.cores}", rack, SECONDS)
+        workshop.run(f"partition-{seconds:g}-{partition.coupling}-{partition.cores}", rack, seconds)
         for partition, rack in zip(PARTITIONS, racks, strict=True)
     ]
     first = _read_path(runs[0].recording)
@@ -116,10 +132,18 @@ def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
 
 PARTITION = Experiment(
     "partition",
-    "the same task with its planners on one core and on two",
+    "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
     tuple[PartitionFigures, ...],
     _measure_partitions,
+    cores=2,
+)
+TASKS = Experiment(
+    "partition-tasks",
+    "the same task with its planners on one core and on two",
+    len(PARTITIONS) * (TASK_S + LAUNCH_S),
+    tuple[PartitionFigures, ...],
+    _measure_tasks,
     cores=2,
 )
 
