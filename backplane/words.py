@@ -186,7 +186,7 @@ class Block:
     # In lockstep, first of the releases given together with RELEASED. Written by the clock.
     FIRST = 29
     FAILED = 30  # place in the code where the last process failed, and how often in a row
-    # In lockstep, tick at which a cycle that takes simulated time goes on, 0 for none. Set by the
+    # In lockstep, tick at which a cycle that takes simulated time continues, else 0. Set by the
     # task, which then waits, and cleared by the clock.
     FINISH = 31
     SCHEDULER = 32  # Scheduler of an executor, 0 if the rack's config names none

@@ -12,9 +12,10 @@ ticks would each cost two context switches and the clock's work, together a fift
 `k1607`. During a batch no other task is released, no message of another task becomes visible, and
 the clock has nothing to do, so the executor reads and writes the same messages as without it.
 
-Computing takes no simulated time, unless a task states at which tick its cycle goes on. The task
-then waits in the middle of the cycle, and the clock does not wait for the task before that tick. In
-the meantime the clock releases the task as in real time, and finds that it misses these releases.
+Computing takes no simulated time, unless a task states the tick at which its cycle continues. The
+task then waits in the middle of the cycle, and the clock does not wait for the task before that
+tick. In the meantime the clock releases the task as in real time, and the task misses these
+releases.
 """
 
 from __future__ import annotations
@@ -195,7 +196,7 @@ class LockstepDriver(ClockDriver):
         return True
 
     def resume_cycles(self, tick: int) -> bool:
-        """Let each cycle that takes simulated time until `tick` go on, and wait for its end.
+        """Continue each cycle that takes simulated time until `tick`, and wait for its end.
 
         Returns:
             False if the launcher has ended or the host requests the end of the run.
@@ -204,7 +205,7 @@ class LockstepDriver(ClockDriver):
         return all(self.resume_cycle(task) for task in due)
 
     def resume_cycle(self, task: ReleasedTask) -> bool:
-        """Let the cycle of a task that waits go on, and wait until it has ended or waits again.
+        """Continue the cycle of a waiting task, and wait until it has ended or waits again.
 
         Its messages may be visible from the next tick, before the task's deadline.
 

@@ -95,7 +95,7 @@ class ReleasedTask:
     def find_next_event(self, tick: int) -> int:
         """Return the task's deadline if it is after `tick`, otherwise its next release tick.
 
-        If a cycle takes simulated time, return the tick at which it goes on.
+        If a cycle takes simulated time, return the tick at which it continues.
         """
         if finish := self.block[Block.FINISH]:
             return finish
@@ -134,7 +134,7 @@ class ReleasedTask:
         return self.block[Block.FINISH] != 0
 
     def resume(self) -> None:
-        """Let a task that waits go on with its cycle."""
+        """Continue the cycle of a waiting task."""
         self.block[Block.FINISH] = 0
         self.wake()
 

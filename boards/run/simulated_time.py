@@ -23,7 +23,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 
 FinishStep = Callable[[int, int, int], int]
-"""Computes the end of a cycle from its release tick, its begin, and its end up to now.
+"""Computes the end of a cycle from its release tick, its begin, and the end before this step.
 
 It depends on nothing but simulated time, so that runs repeat. Before all steps, the end is the
 begin.
