@@ -112,8 +112,12 @@ def list_brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Br
         for change in changes
         if change.code == "brakes_opened"
     ]
-    if changes and changes[-1].code == "brakes_closed":
-        engagements.append((changes[-1].subject, changes[-1].tick, end))
+    last_of_each_arm = {change.board: change for change in changes}.values()
+    engagements += [
+        (change.subject, change.tick, end)
+        for change in last_of_each_arm
+        if change.code == "brakes_closed"
+    ]
     return tuple(
         Braking(why, since, round((until - since) * tick_ms, 6))
         for why, since, until in engagements

@@ -253,8 +253,8 @@ def test_a_journal_stamps_events_and_passes_them_on(bus: Segment) -> None:
 
 
 def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
-    def change(tick: int, code: str, why: str, value: int = 0) -> Event:
-        return Event(0, tick, "reaction", "arm", "", code, subject=why, value=value)
+    def change(tick: int, code: str, why: str, value: int = 0, arm: str = "arm") -> Event:
+        return Event(0, tick, "reaction", arm, "", code, subject=why, value=value)
 
     events = [
         change(2, "brakes_opened", "", 2),  # of the start
@@ -276,3 +276,6 @@ def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
     )
     assert format_brakings(found) == told
     assert list_brakings(events[:1], 200, 2.0) == list_brakings([], 200, 2.0) == ()
+    # The brakes of one arm stay engaged, although those of another have been released since.
+    left = change(160, "brakes_opened", "sensors", 10, arm="left")
+    assert list_brakings([*events, left], 200, 2.0)[-1] == found[-1]
