@@ -178,7 +178,7 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
     A relative path is looked up in `folder`, then among the bundled files in configs/.
     """
 
-    def find(text: str) -> str:
+    def find_file(text: str) -> str:
         """Return the absolute path of the file to which `text` refers, whether it exists or not."""
         return str(_find_referenced_file(text, folder) or folder / text)
 
@@ -187,12 +187,12 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
         return str(_find_referenced_file(text, folder) or text)
 
     for keys, change in (
-        (("robot", "model"), find),
+        (("robot", "model"), find_file),
         (("python_path",), lambda text: str((folder / text).resolve())),
         (("adapter", ANY, "certificates"), lambda text: str(folder / text)),
         (("adapter", ANY, "launch"), find_config),
         (("adapter", ANY, "partners"), find_config),
-        (STATE_TABLES, find),
+        (STATE_TABLES, find_file),
     ):
         tables = change_texts(tables, keys, change)
     return tables

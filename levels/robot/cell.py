@@ -333,7 +333,7 @@ def find_gripper(
     if config is None:
         return None, np.zeros(model.nbody, dtype=bool)
     name = config.joint
-    joint = lookup.find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
+    joint = lookup.find_element(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
     body = model.jnt_bodyid[joint]
     if name in robot.joints or not moved[body]:
         raise RobotError(

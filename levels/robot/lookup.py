@@ -32,7 +32,7 @@ COUNT_ATTRIBUTES = {
 """Attribute of a model that counts its elements, for each kind of element."""
 
 
-def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
+def find_element(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
     """Return the id of a named element.
 
     Args:
@@ -70,7 +70,7 @@ def find_all(
     Raises:
         RobotError: The model does not have one of the elements.
     """
-    return np.array([find(model, kind, name, place) for name in names], dtype=int)
+    return np.array([find_element(model, kind, name, place) for name in names], dtype=int)
 
 
 def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
@@ -94,7 +94,7 @@ def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     ):
         for name in names:
             try:
-                find(model, element_kind, name, place)
+                find_element(model, element_kind, name, place)
             except RobotError as error:
                 yield str(error)
 
@@ -110,7 +110,7 @@ def find_tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     Raises:
         RobotError: The site is missing or on another body.
     """
-    tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
+    tool = find_element(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
     if moved is not None and not moved[model.site_bodyid[tool]]:
         raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
     return tool

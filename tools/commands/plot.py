@@ -153,11 +153,11 @@ def _build_plot(
             raise Failure(f"{when}: does not hold from {from_s:g} to {to_s:g} s")
         marks.append(Mark(held_s, "trigger", when, held_s))
         from_s, to_s = max(held_s - BEFORE_S, begins_s), min(held_s + AFTER_S, ends_s)
-    cut = [series.cut(from_s, to_s) for series in all_series]
-    if missing := [series.name for series in cut if not len(series.time_s)]:
+    selected = [series.select_window(from_s, to_s) for series in all_series]
+    if missing := [series.name for series in selected if not len(series.time_s)]:
         raise Failure(f"{missing[0]}: no message until {to_s:g} s", 2)
     shown = [mark for mark in marks if mark.time_s <= to_s and mark.until_s >= from_s]
-    return Plot(title, cut, sorted(shown), (from_s, to_s))
+    return Plot(title, selected, sorted(shown), (from_s, to_s))
 
 
 def _read_signals(recording: Recording, names: list[str], run: str) -> list[Series]:

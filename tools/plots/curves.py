@@ -62,7 +62,7 @@ class Series(NamedTuple):
         """Name of the number, as in `servo.status.position[2]`."""
         return f"{self.signal.name}{self.place}"
 
-    def cut(self, from_s: float, to_s: float) -> Series:
+    def select_window(self, from_s: float, to_s: float) -> Series:
         """Return the messages in a window of time, and the last one before it."""
         first, end = np.searchsorted(self.time_s, (from_s, to_s), "right").tolist()
         chosen = slice(max(first - 1, 0), end)

@@ -16,7 +16,7 @@ from rack.levels.algebra import Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.hand import compute_moments
 from rack.levels.robot.linkage import find_coupled_joints
-from rack.levels.robot.lookup import find, mark_descendants
+from rack.levels.robot.lookup import find_element, mark_descendants
 from rack.levels.robot.model import SCALAR_JOINTS, check_joint_count, format_names
 
 GRIPPER_NAMES = re.compile("finger|grip|jaw|claw|knuckle|thumb", re.IGNORECASE)
@@ -55,12 +55,12 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
     scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
     others: list[int] = []
     if joints:
-        ids = [find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "--joints") for name in joints]
+        ids = [find_element(model, mujoco.mjtObj.mjOBJ_JOINT, name, "--joints") for name in joints]
         end = int(model.jnt_bodyid[ids[-1]])
     elif tip:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
         body = mujoco.mjtObj.mjOBJ_BODY
-        end = int(model.site_bodyid[site]) if site >= 0 else find(model, body, tip, "--tip")
+        end = int(model.site_bodyid[site]) if site >= 0 else find_element(model, body, tip, "--tip")
     else:
         end, others = _find_longest_arm(model, scalar, driven)
     if not joints:

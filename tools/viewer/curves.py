@@ -84,14 +84,16 @@ def build_joint_curves(stream: Stream, names: Sequence[str], cell: Cell) -> Iter
             labels = [f"{name} {meaning}, {QUANTITIES[quantity]}" for meaning in fields]
             shades = [COMMANDED, colours[index]][-len(fields) :]
 
-            def select(
+            def select_joint(
                 block: RowBlock, index: int = index, fields: dict[str, str] = fields
             ) -> Array:
                 """Return the values of the fields for one joint, shape (rows, fields)."""
                 columns = [block.messages[field][:, index] for field in fields.values()]
                 return np.stack(columns, axis=-1)
 
-            yield build_curves(stream, entity, select, labels, shades, OVERLAID[-len(fields) :])
+            yield build_curves(
+                stream, entity, select_joint, labels, shades, OVERLAID[-len(fields) :]
+            )
     labels = [f"{name}, mrad" for name in names]
     yield build_curves(
         stream,

@@ -110,7 +110,7 @@ class BlockExecutor(Executor):
         if self.arm.message.braked:
             self._settled_tick = tick + round(SETTLE_S / self.context.tick_s)
         # The brakes change the torques, too, which is no touch.
-        status.stop = network.compute(self.context.period_s) and tick >= self._settled_tick
+        status.stop = network.compute_blocks(self.context.period_s) and tick >= self._settled_tick
         for number, name in enumerate(network.results):
             status.values[number] = network.values[name]
         outputs = list(network.outputs)
@@ -125,7 +125,7 @@ class BlockExecutor(Executor):
         if self.settings is not before:
             try:
                 target, _, source = self.settings.wire.partition("=")
-                self.network.connect(target.strip(), source.strip())
+                self.network.connect_ports(target.strip(), source.strip())
             except LevelError as error:
                 self.settings = before
                 self._orders.refuse_newest(str(error))
@@ -139,7 +139,7 @@ def restore_network(network: BlockNetwork, status: BlockStatus | AnyMessage) -> 
         target: outputs[number]
         for target, number in zip(network.inputs, status.wired.tolist(), strict=False)
     }
-    network.connect(STOP, network.wires[STOP])
+    network.connect_ports(STOP, network.wires[STOP])
 
 
 class WiredMotion(TrajectoryExecutor):

@@ -118,9 +118,9 @@ class BlockNetwork:
         self.wires: dict[str, str] = {}
         self._order: list[str] = []
         for target, source in wires.items():
-            self.connect(target, source)
+            self.connect_ports(target, source)
 
-    def connect(self, target: str, source: str) -> None:
+    def connect_ports(self, target: str, source: str) -> None:
         """Connect an input to another output.
 
         Args:
@@ -155,7 +155,7 @@ class BlockNetwork:
             raise LevelError(f"{target}={source} closes the cycle {path}; add a delay") from None
         self.wires = wires
 
-    def compute(self, period_s: float) -> bool:
+    def compute_blocks(self, period_s: float) -> bool:
         """Compute all blocks from `values` of the sources. Return the value of `stop.input`."""
         values = self.values
         blocks = self.blocks

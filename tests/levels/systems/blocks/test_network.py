@@ -75,11 +75,11 @@ def test_a_connection_that_is_not_permitted_is_refused_and_nothing_changes(
     network: BlockNetwork, target: str, source: str, reason: str
 ) -> None:
     with pytest.raises(LevelError) as refused:
-        network.connect(target, source)
+        network.connect_ports(target, source)
     assert str(refused.value) == reason
     assert network.wires == WIRES
     network.values["arm.torque"] = 10.0
-    assert network.compute(PERIOD_S)
+    assert network.compute_blocks(PERIOD_S)
 
 
 @pytest.mark.parametrize(
@@ -102,14 +102,14 @@ def test_a_config_without_a_connection_or_with_a_wrong_name_is_refused(
 def test_values_pass_all_blocks_in_one_cycle_and_a_delay_in_two(network: BlockNetwork) -> None:
     values = network.values
     values["arm.torque"] = 8.0
-    assert network.compute(PERIOD_S)
+    assert network.compute_blocks(PERIOD_S)
     assert [values[f"{name}.output"] for name in BLOCKS] == [4.0, 4.0, 4.0, 4.0, 1.0, 1.0]
     values["arm.torque"] = 0.0
-    network.compute(PERIOD_S)
+    network.compute_blocks(PERIOD_S)
     assert [values[f"{name}.output"] for name in BLOCKS] == [2.0, -2.0, 2.0, 2.0, 0.0, 0.0]
     # A flag of the arm stops as well.
     values["arm.braked"] = 1.0
-    assert network.compute(PERIOD_S)
+    assert network.compute_blocks(PERIOD_S)
 
 
 def test_another_connection_acts_in_the_next_cycle_and_a_delay_may_close_a_cycle(
@@ -117,26 +117,26 @@ def test_another_connection_acts_in_the_next_cycle_and_a_delay_may_close_a_cycle
 ) -> None:
     values = network.values
     values["arm.torque"] = 8.0
-    network.compute(PERIOD_S)
-    network.connect("change.b", "past.output")
+    network.compute_blocks(PERIOD_S)
+    network.connect_ports("change.b", "past.output")
     seen = []
     for _ in range(4):
-        network.compute(PERIOD_S)
+        network.compute_blocks(PERIOD_S)
         seen.append(values["size.output"])
     # Each value is the torque without the value before it.
     assert seen == [4.0, 4.0, 4.0, 4.0]
     values["arm.torque"] = 5.0
-    network.compute(PERIOD_S)
-    network.compute(PERIOD_S)
+    network.compute_blocks(PERIOD_S)
+    network.compute_blocks(PERIOD_S)
     assert values["size.output"] == 4.0
 
 
 def test_a_restarted_board_continues_with_the_connections_and_values_of_its_status(
     network: BlockNetwork,
 ) -> None:
-    network.connect("change.b", "past.output")
+    network.connect_ports("change.b", "past.output")
     network.values["arm.torque"] = 8.0
-    network.compute(PERIOD_S)
+    network.compute_blocks(PERIOD_S)
     status = BlockStatus.zeros({})
     outputs = list(network.outputs)
     for number, name in enumerate(network.results):
