@@ -36,7 +36,8 @@ executor = "queue_levels:Answering"
 FAST = (
     "board.upper.rate_hz=100",
     "board.lower.rate_hz=50",
-    "protocol.depth={ 'upper.requests' = 512 }",
+    # Room for what is sent during a restart that takes ten seconds.
+    "protocol.depth={ 'upper.requests' = 4096 }",
 )
 PLANNING = f"""{CLOCK}
 [board.wave]
