@@ -249,6 +249,11 @@ def test_a_prompt_is_refused_on_a_rack_of_another_user(guarded: Spied) -> None:
     assert "belongs to user 4711" in done.stderr
 
 
+def has_attached(pid: int, rack_name: str) -> bool:
+    """Return whether a process has mapped the segment of a rack."""
+    return rack_name in Path(f"/proc/{pid}/maps").read_text()
+
+
 @pytest.mark.slow
 def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -> None:
     environment = {**os.environ, "PYTHONPATH": str(guarded.marker.parent)}
@@ -265,6 +270,7 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
     try:
         spool = guarded.run.parent / "recorded" / "published.json"
         wait_until(spool.exists)
+        wait_until(lambda: all(has_attached(one.pid, guarded.rack) for one in started.values()))
         stopped = rack("stop", guarded.rack, "--wait", BOUND_S)
         assert stopped.returncode == 0, stopped.stderr
         for command, process in started.items():
