@@ -13,6 +13,7 @@ import pytest
 from rack.boards.crate import patience
 from rack.levels import references
 from rack.tools.cli import run_commands
+from rack.tools.console import progress
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUND_S = 100
@@ -23,7 +24,7 @@ runs."""
 def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run a command from a folder, by default the project's, and return a completed process.
 
-    On a slow machine, too, it does not say what its launch waits for.
+    On a slow machine, too, it does not say how far it is, or what its launch waits for.
     """
     before, out, err, status = sys.argv, StringIO(), StringIO(), 0
     sys.argv = ["rack", *map(str, arguments)]
@@ -36,6 +37,7 @@ def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess
         ):
             patch.setattr(patience, "PATIENCE_S", BOUND_S)
             patch.setattr(references, "SLOW_S", references.MAX_IMPORT_S)
+            patch.setattr(progress, "LINE_INTERVAL_S", BOUND_S)
             run_commands()
     except SystemExit as end:
         status = int(end.code or 0)

@@ -94,7 +94,9 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
         finally:
             # Not by a signal, which ends it in a hurry.
             subprocess.run([*RACK, "stop", rack_name], capture_output=True, timeout=WATCHDOG_S)
-    assert (done.returncode, done.stderr) == (0, "")
+    # On a slow machine it says how far it is.
+    said = [line for line in done.stderr.splitlines() if not line.startswith("merging the rec")]
+    assert (done.returncode, said) == (0, [])
     assert re.search(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", status.stdout)
     answer = json.loads(done.stdout)
     files = [path for path in saved.rglob("*") if path.is_file() and path.name != CHECKSUMS]
