@@ -21,6 +21,7 @@ from rack.boards.config import load
 from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
+from rack.tools.console import interrupt
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
@@ -211,15 +212,22 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
         recorder = stack.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes))
         stack.callback(recorder.kill)
         wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
+        sent_s = time.monotonic()
         send(recorder.pid, number)
         out, said = recorder.communicate(timeout=WATCHDOG_S)
+        took_s = time.monotonic() - sent_s
     assert recorder.returncode == 128 + number, said
+    is_finished = not any((each / "recorder.spool").exists() for each in folders)
+    for each in folders:
+        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
+    if not out:
+        # On a slow machine the time for an end in order does not suffice.
+        assert took_s > interrupt.BOUND_S
+        return
     notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' creates it"] if count > 1 else []
     assert json.loads(out)["notes"] == notes
     assert (folder / "run.rrd").exists() == (count == 1)
-    for each in folders:
-        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
-        assert not (each / "recorder.spool").exists()
+    assert is_finished
 
 
 def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None:
