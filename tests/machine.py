@@ -11,9 +11,10 @@ import fcntl
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
@@ -24,6 +25,9 @@ from tests.network_lab import Lab
 WAIT_S = 600.0
 """Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the
 test's own time."""
+REPEAT_S = 150.0
+"""Time in which a run that the machine has disturbed is begun again: half the time-out of a
+test."""
 _FOLDER = Path(tempfile.gettempdir())
 
 
@@ -50,6 +54,33 @@ def stolen() -> int:
     """Return how long the hypervisor has held cores back since the machine began, in the kernel's
     steps of 10 ms."""
     return int(STAT.read_text().split(maxsplit=STEAL_COLUMN + 1)[STEAL_COLUMN])
+
+
+Run = TypeVar("Run")
+
+
+def run_undisturbed(
+    run: Callable[[], Run], find_disturbance: Callable[[Run], str], times: int = 10
+) -> Run:
+    """Return the first run in real time that the machine has not disturbed; the test fails when all
+    were.
+
+    Only for what a machine that does other work cannot show. The judgement on a run rests on what
+    it recorded about its clock, never on what the test asserts about it.
+
+    Args:
+        run: Runs once.
+        find_disturbance: Says what disturbed a run; "" for nothing.
+        times: Most runs. None begins later than `REPEAT_S` after the first.
+    """
+    found: list[str] = []
+    end_s = time.monotonic() + REPEAT_S
+    while len(found) < times and time.monotonic() < end_s:
+        result = run()
+        if not (why := find_disturbance(result)):
+            return result
+        found.append(why)
+    return pytest.fail(f"the machine disturbed each of {len(found)} runs: {'; '.join(found)}")
 
 
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")

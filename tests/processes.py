@@ -5,18 +5,19 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 RACK = (sys.executable, "-m", "rack.tools.cli")
 """The `rack` command of the environment that runs the tests."""
-BOUND_S = 20.0
-"""Bound of every wait: reached only when something is broken."""
+BOUND_S = 50.0
+"""Bound of every wait: reached only when something is broken, on a machine ten times slower too."""
 FORKS = "ignore:.*multi-threaded, use of fork:DeprecationWarning"
 """Filter for tests that fork: a worker here touches shared memory alone, none of the parent's
 threads' locks."""
@@ -73,6 +74,25 @@ def wait_until(condition: Callable[[], object], bound_s: float = BOUND_S) -> Non
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {bound_s:g} s")
         time.sleep(0.001)
+
+
+def start_rack(command: Sequence[str | Path], name: str, log: Path) -> subprocess.Popen[bytes]:
+    """Start a command that runs a rack, and return once the rack has begun to tick.
+
+    What it says is in the file `log`: a rack in real time on a busy machine says so much that a
+    pipe which nobody reads would be full, and a launcher that waits for its reader restarts no
+    board.
+    """
+    with log.open("w") as said:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+
+    def has_begun() -> bool:
+        whole, _, _ = log.read_text().rpartition("\n")
+        return any(line.startswith(name) and "tick 0 " not in line for line in whole.splitlines())
+
+    wait_until(lambda: has_begun() or process.poll() is not None, 2 * BOUND_S)
+    assert process.poll() is None, log.read_text()
+    return process
 
 
 @contextmanager

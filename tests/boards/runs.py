@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Outcome
 from rack.boards.faults.config import FaultConfig
 from tests.processes import BOUND_S
+
+END_TICKS = 40
+"""Ticks of a run after what it was waited for."""
 
 
 def faulty(config: RackConfig, *faults: Mapping[str, Any]) -> RackConfig:
@@ -30,6 +34,21 @@ def end_of(rack: Rack) -> Outcome:
         assert time.monotonic() < deadline
     assert rack.outcome is not None
     return rack.outcome
+
+
+def watch_until(rack: Rack, condition: Callable[[], object]) -> None:
+    """Watch a running rack until a condition holds, however long the machine takes for it."""
+    deadline = time.monotonic() + BOUND_S
+    while not condition():
+        assert rack.watch(0.01), "the run has ended"
+        assert time.monotonic() < deadline
+
+
+def run_until(rack: Rack, condition: Callable[[], object]) -> Outcome:
+    """Watch a running rack until a condition holds; then let its time be over soon."""
+    watch_until(rack, condition)
+    rack.segment.words[System.STOP_TICK] = rack.segment.words[System.TICK] + END_TICKS
+    return end_of(rack)
 
 
 def stop(rack: Rack) -> Outcome:

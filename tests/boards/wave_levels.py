@@ -12,9 +12,15 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.message import Message, State, Status, field
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, FindingKind, Input, LevelContext, Output, Planner
+
+LONGEST_S = 20.0
+"""Bound of a cycle that waits for releases: reached only when something is broken."""
 
 
 class WaveStatus(Status, version=1, message="wave"):
@@ -35,7 +41,9 @@ class Trouble:
         params: Mapping[str, Any] = context.params
         self._kind = params.get("trouble", "none")
         self._at = params.get("at", 0)
-        self._took_ns = params.get("ticks", 0) * context.clock_ns
+        self._ticks = params.get("ticks", 0)
+        self._took_ns = self._ticks * context.clock_ns
+        self._rack, self._board = context.rack, context.board
 
     def self_test(self) -> None:
         if self._kind == "refuse":
@@ -58,6 +66,19 @@ class Trouble:
             end = time.monotonic_ns() + self._took_ns
             while time.monotonic_ns() < end:
                 pass
+        elif self._kind == "outlast" and tick >= self._at:
+            self._kind = "none"
+            self._outlast(tick + self._ticks)
+
+    def _outlast(self, tick: int) -> None:
+        """Compute until the clock has given the release of `tick`, however late the clock is, and
+        its time has come."""
+        segment = Segment.attach(self._rack)
+        clock, block = SystemClock(segment), segment.get_block(self._board)
+        end = time.monotonic() + LONGEST_S
+        while min(block[Block.RELEASED], clock.compute_tick()) < tick:
+            if time.monotonic() > end:
+                raise TimeoutError(f"no release of tick {tick} within {LONGEST_S:g} s")
 
 
 class Wave(Executor):

@@ -8,20 +8,36 @@ from contextlib import chdir, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 
+import pytest
+
+from rack.boards.crate import patience
+from rack.levels import references
 from rack.tools.cli import run_commands
+from rack.tools.console import progress
 
 ROOT = Path(__file__).resolve().parents[2]
-BOUND_S = 50
+BOUND_S = 100
 """Bound of a command that a test starts as a process: for its signals, or to go on while it
 runs."""
 
 
 def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run a command from a folder, by default the project's, and return a completed process."""
+    """Run a command from a folder, by default the project's, and return a completed process.
+
+    On a slow machine, too, it does not say how far it is, or what its launch waits for.
+    """
     before, out, err, status = sys.argv, StringIO(), StringIO(), 0
     sys.argv = ["rack", *map(str, arguments)]
     try:
-        with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            chdir(folder),
+            redirect_stdout(out),
+            redirect_stderr(err),
+        ):
+            patch.setattr(patience, "PATIENCE_S", BOUND_S)
+            patch.setattr(references, "SLOW_S", references.MAX_IMPORT_S)
+            patch.setattr(progress, "LINE_INTERVAL_S", BOUND_S)
             run_commands()
     except SystemExit as end:
         status = int(end.code or 0)

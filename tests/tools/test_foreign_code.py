@@ -18,7 +18,7 @@ from rack.backplane.segment import Segment, list_racks
 from rack.boards.faults import KINDS
 from rack.tools.cli import COMMANDS
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.processes import RACK, wait_until
+from tests.processes import RACK, start_rack, wait_until
 from tests.tools.command_line import BOUND_S, rack
 
 MODULE = "spy_levels"
@@ -145,25 +145,21 @@ def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
     modes = {name: "--set=clock.mode=realtime", f"{name}-steps": "--lockstep"}
     with ExitStack() as stack:
         for one, mode in modes.items():
-            stack.enter_context(_launched(one, [*command, f"--set=name={one}", mode]))
+            log = folder / f"{one}.log"
+            stack.enter_context(_launched(one, [*command, f"--set=name={one}", mode], log))
         marker.unlink()
         yield Spied(*modes, run, marker)
 
 
 @contextmanager
-def _launched(name: str, command: Sequence[str]) -> Iterator[None]:
+def _launched(name: str, command: Sequence[str], log: Path) -> Iterator[None]:
     """Run a rack that has begun to tick, and end it."""
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([*command, "--no-record"], **pipes)
+    process = start_rack([*command, "--no-record"], name, log)
     try:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith(name.encode()) and b"tick 0 " not in line:
-                break
         yield
     finally:
         process.terminate()
-        process.communicate(timeout=BOUND_S)
+        process.wait(BOUND_S)
 
 
 @pytest.fixture
@@ -249,6 +245,11 @@ def test_a_prompt_is_refused_on_a_rack_of_another_user(guarded: Spied) -> None:
     assert "belongs to user 4711" in done.stderr
 
 
+def has_attached(pid: int, rack_name: str) -> bool:
+    """Return whether a process has mapped the segment of a rack."""
+    return rack_name in Path(f"/proc/{pid}/maps").read_text()
+
+
 @pytest.mark.slow
 def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -> None:
     environment = {**os.environ, "PYTHONPATH": str(guarded.marker.parent)}
@@ -265,6 +266,7 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
     try:
         spool = guarded.run.parent / "recorded" / "published.json"
         wait_until(spool.exists)
+        wait_until(lambda: all(has_attached(one.pid, guarded.rack) for one in started.values()))
         stopped = rack("stop", guarded.rack, "--wait", BOUND_S)
         assert stopped.returncode == 0, stopped.stderr
         for command, process in started.items():

@@ -120,9 +120,13 @@ def print_into_closed_pipe(arguments: list[str]) -> subprocess.CompletedProcess[
         [*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True
     ) as process:
         os.close(writer)
-        os.read(reader, 1)
-        os.close(reader)
-        _, errors = process.communicate(timeout=BOUND_S)
+        try:
+            os.read(reader, 1)
+            os.close(reader)
+            _, errors = process.communicate(timeout=BOUND_S)
+        finally:
+            # A test that is over its time would wait for it for ever.
+            process.kill()
     return subprocess.CompletedProcess(arguments, process.returncode, "", errors)
 
 

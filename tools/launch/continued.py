@@ -238,7 +238,7 @@ class RepeatedRun:
         """Repeat the run up to `tick`, and describe its first message that differs.
 
         Returns:
-            A clause. Empty if the run cannot be recorded again.
+            A clause. Empty if the run cannot be recorded again, or if no message differs.
         """
         config = self._unique_config("again")
         begins = self._find_beginning(self._branched_at or 0)
@@ -246,7 +246,10 @@ class RepeatedRun:
             folder = Path(name) / "again"
             run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
             runs = self.recording, Recording(folder)
-            first = list_divergent_messages(*runs)[0]
+            differing = list_divergent_messages(*runs)
+            if not differing:
+                return ""
+            first = differing[0]
             box = self.recording.layout.find_mailbox(first.mailbox)
             recorded, repeated = (find_row(run, box, first.serial) for run in runs)
             where = f"first {box.name} at tick {first.tick}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.slots import CHECKED_FROM
+from rack.backplane.trace import SKIPPED_SHIFT
 from rack.tools.console.answer import Failure
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin
@@ -108,11 +109,18 @@ def list_divergent_messages(first_run: Recording, second_run: Recording) -> list
 
 
 def find_tick_range(recording: Recording) -> tuple[int, int]:
-    """Return the range of ticks of a recorded run: its first tick, and the tick after its last."""
-    ticks_by_task = [rows["tick"] for rows in recording.cycles.values()]
+    """Return the range of ticks of a recorded run: its first tick, and the tick after its last.
+
+    The first record of a task contains the number of releases skipped before it. A run whose clock
+    was late at its start therefore begins at its first release, not at its first cycle.
+    """
+    begins, ends = [], []
+    for name, rows in recording.cycles.items():
+        skipped = int(rows["flags"][0]) >> SKIPPED_SHIFT
+        begins.append(int(rows["tick"][0]) - skipped * recording.layout.find_task(name).every)
+        ends.append(int(rows["tick"][-1]) + 1)
     end: int = recording.end_counts.get("outcome", {}).get("ticks", 0)
-    end = end or max((int(ticks[-1]) + 1 for ticks in ticks_by_task), default=0)
-    return min((int(ticks[0]) for ticks in ticks_by_task), default=0), end
+    return min(begins, default=0), end or max(ends, default=0)
 
 
 def find_common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:

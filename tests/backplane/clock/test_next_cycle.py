@@ -25,7 +25,8 @@ from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
 PERIOD_NS = 2_500_000
-LONG_NS = 20_000_000
+HOUR_NS = 3_600_000_000_000
+"""A tick that no machine is late by."""
 
 
 @pytest.fixture
@@ -196,23 +197,23 @@ def test_a_sleeping_task_sleeps_until_its_next_grid_point_if_the_clock_skips_one
 
 @TIMER
 def test_a_release_that_the_clock_makes_up_for_after_a_skip_wakes_a_sleeping_task(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
+    bus: Segment,
 ) -> None:
-    # Ahead of its grid points on a busy machine too.
-    monkeypatch.setattr("rack.backplane.clock.driver.LEAD_NS", LONG_NS)
-    cycle, taken = NextCycle(bus, "level"), []
-    start_grid(bus, -LONG_NS, LONG_NS)
-
-    def ended(tick: int) -> int | None:
-        # Skips the tick of the task's release, and is on time in the next one.
-        driver.skip = int(tick == EVERY)
-        return tick if tick > 2 * EVERY else None
-
-    driver = RealtimeDriver(bus, ended)
-    with in_thread(driver.run):
-        while (tick := cycle.wait()) is not None:
-            taken.append((tick, cycle.skipped))
-    assert taken == [(0, 0), (EVERY, 0), (2 * EVERY, 0)]
+    cycle, post = NextCycle(bus, "level"), get_wake_semaphore(bus, "level")
+    # Half an hour ahead of the grid point of tick 5, however long this takes.
+    start_grid(bus, 5 * HOUR_NS - HOUR_NS // 2, HOUR_NS)
+    driver = RealtimeDriver(bus, lambda tick: None)
+    driver._release_tasks(0, -1)
+    assert (post.try_acquire(), cycle.wait(), cycle.skipped) == (True, 0, 0)
+    # The tick of the task's release was skipped. The task has found nothing at its grid point.
+    driver._release_tasks(EVERY + 1, EVERY - 1)
+    assert (post.value, cycle.wait(), cycle.skipped) == (1, EVERY, 0)
+    assert post.try_acquire()
+    # On time, it finds its release by itself.
+    driver._release_tasks(2 * EVERY, 2 * EVERY - 1)
+    assert post.value == 0
+    start_grid(bus, 2 * EVERY * HOUR_NS, HOUR_NS)
+    assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
 
 
 @TIMER
@@ -225,9 +226,11 @@ def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ah
     assert cycle.wait() == 0
     # The task is kept from its core from its first grid point to shortly before its second: a clock
     # that works ahead has released both.
-    start_grid(bus, 2 * EVERY * PERIOD_NS - PERIOD_NS)
+    start_grid(bus, 2 * EVERY * HOUR_NS - HOUR_NS, HOUR_NS)
     publish(bus, 2 * EVERY)
     assert (cycle.wait(), cycle.skipped) == (EVERY, 0)
+    # An hour later.
+    start_grid(bus, 2 * EVERY * HOUR_NS, HOUR_NS)
     assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
 
 

@@ -17,7 +17,7 @@ from rack.boards import Rack
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, PLANNED, MakeConfig
-from tests.processes import children_of, descriptors, open_files, wait_until
+from tests.processes import BOUND_S, children_of, descriptors, open_files, wait_until
 from tests.warm import programs
 
 
@@ -63,9 +63,15 @@ def test_the_reason_of_a_board_is_the_launch_error_and_holds_its_sysfail(
 def test_a_board_that_is_never_ready_is_named(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
-    settings = ("board.watch.executor=wave_levels:Endless",)
-    assert refusal(Rack(config(*settings))) == "boards watch: not ready within 2 s"
+    endless = config("board.watch.executor=wave_levels:Endless")
+    # On a slow machine the other boards are not ready that soon either, and are named too.
+    for limit_s in (2.0, 8.0, BOUND_S):
+        monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", limit_s)
+        reason = refusal(Rack(endless))
+        if reason == f"boards watch: not ready within {limit_s:g} s":
+            return
+        assert re.search(rf"not (ready|done) within {limit_s:g} s", reason)
+    pytest.fail(reason)
 
 
 def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> None:

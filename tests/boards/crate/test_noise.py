@@ -215,7 +215,9 @@ def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothin
         segment.words[address // 8] = count
         segment.close()
         _, err = process.communicate(timeout=BOUND_S)
-    said = "the rack's shared memory is damaged: 4711 is not a value of Alarm"
-    assert (process.returncode, err) == (1, f"{said}\n")
+    # On a busy machine further lines of progress come before it.
+    said = [line for line in err.splitlines() if not line.startswith(rack_name)]
+    assert process.returncode == 1
+    assert said == ["the rack's shared memory is damaged: 4711 is not a value of Alarm"]
     assert rack_name not in list_racks()
     wait_until(lambda: not named(f"{rack_name}:"))

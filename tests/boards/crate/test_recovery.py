@@ -16,7 +16,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
-from tests.boards.runs import end_of, faulty, kill
+from tests.boards.runs import faulty, kill, run_until, watch_until
 
 TASKS = ("wave", "wave.planner", "watch")
 RESTART_TICKS = 200
@@ -125,17 +125,16 @@ def test_a_loss_has_the_configured_effect_on_the_arm(
 @pytest.mark.parametrize("victim", ["wave.planner", "clock"])
 def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim: str) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(1.5)
+        rack.start()
         words = rack.segment.words
-        while words[System.TICK] < 40:
-            assert rack.watch(0.05)
+        watch_until(rack, lambda: words[System.TICK] >= 40)
         pid = (
             words[System.CLOCK_PID]
             if victim == "clock"
             else rack.segment.get_block(victim)[Block.PID]
         )
         os.kill(pid, signal.SIGKILL)
-        outcome = end_of(rack)
+        outcome = run_until(rack, lambda: of(rack.events, "recovery", "rejoined"))
     assert (outcome.cause, outcome.is_success) == ("time over", True)
     assert [event.board for event in of(rack.events, "died")] == [victim]
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
@@ -143,9 +142,11 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
 
 @pytest.mark.slow
 def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
-    outcome, events = run(
-        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 40})
-    )
+    fault = {"kind": "clock-stop", "board": "clock", "tick": 40}
+    with Rack(faulty(config("clock.mode=realtime"), fault)) as rack:
+        events = rack.events
+        rack.start()
+        outcome = run_until(rack, lambda: of(events, "recovery", "rejoined"))
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
     # The clock itself may have been late and skipped the fault's tick.
@@ -157,19 +158,20 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
 @pytest.mark.slow
 def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(1.5)
+        rack.start()
         words = rack.segment.words
-        while words[System.TICK] < 40:
-            assert rack.watch(0.05)
+        watch_until(rack, lambda: words[System.TICK] >= 40)
         dead = words[System.CLOCK_PID]
         os.kill(dead, signal.SIGKILL)
-        while not of(rack.events, "recovery", "rejoined"):
-            assert rack.watch(0.05)
+        watch_until(rack, lambda: of(rack.events, "recovery", "rejoined"))
         AlarmWriter(rack.segment, "watch").raise_alarm(
             words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 40
         )
-        end_of(rack)
-    assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
+
+        def reporters() -> list[str]:
+            return [event.board for event in of(rack.events, "detection", "clock_stopped")]
+
+        run_until(rack, lambda: "watch" in reporters())
     assert [event.board for event in of(rack.events, "died")] == ["clock"]
 
 
@@ -184,16 +186,15 @@ def test_the_latch_is_set_before_the_start_and_reset_by_it(config: MakeConfig) -
 @pytest.mark.slow
 def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(1.5)
-        words, demands = rack.segment.words, []
-        for latch in (1, 0):
+        rack.start()
+        words = rack.segment.words
+        for latch, demand in ((1, 2), (0, 0)):
             words[System.EMERGENCY_STOP] = latch
+            watch_until(rack, lambda demand=demand: words[System.DEMAND] == demand)  # type: ignore[misc]
             tick = words[System.TICK]
-            while words[System.TICK] < tick + 40:
-                assert rack.watch(0.02)
-            demands.append(words[System.DEMAND])
-        end_of(rack)
-    assert demands == [2, 0]
+            watch_until(rack, lambda tick=tick: words[System.TICK] >= tick + 40)  # type: ignore[misc]
+            assert words[System.DEMAND] == demand
+        run_until(rack, lambda: True)
     assert [event.kind for event in rack.events if event.code == "demand"] == [
         "reaction",
         "recovery",

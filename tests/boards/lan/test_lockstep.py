@@ -205,7 +205,14 @@ def test_racks_of_different_clocks_say_so_and_end(
         *configs(texts[:1], tmp_path, STEPPED),
         *configs(texts[1:], tmp_path, STEPPED, setting),
     ]
-    first, _ = run_together(racks, [1.0, 0.5])
+    with running(racks) as (one, other):
+        one.start(1.0)
+        other.start()
+        # However long they take to connect.
+        watch([one, other], until=lambda: one.outcome is not None)
+        first = ended(one)
+        other.stop("the test has seen enough")
+        watch([other])
     assert first.outcome.cause == "board lost"
     assert text.format(names[1]) in first.texts
     assert "restart" not in first.texts

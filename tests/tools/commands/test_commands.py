@@ -57,6 +57,8 @@ def wait_until_gone(name: str) -> bool:
     return name not in list_racks()
 
 
+WAITS = ("waiting: ", "still importing ")
+"""How lines begin that say what a launch waits for."""
 HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
 
 
@@ -160,7 +162,9 @@ def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
     )
     reason = "cannot import 'own_upper': ImportError: it ended the process: exit status 5"
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f'board.upper.executor = "own_upper:Upper": {reason}\n'
+    # On a slow machine it also says what it waits for.
+    said = [line for line in done.stderr.splitlines() if not line.startswith(WAITS)]
+    assert said == [f'board.upper.executor = "own_upper:Upper": {reason}']
 
 
 @pytest.mark.slow
@@ -174,7 +178,9 @@ def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_na
     )
     assert process.stderr is not None
     try:
-        assert process.stderr.readline() == "still importing 'own_upper'; it may take 60 s\n"
+        # On a slow machine other modules before it, and the crate.
+        said = next(line for line in process.stderr if "own_upper" in line)
+        assert said == "still importing 'own_upper'; it may take 60 s\n"
         family = list(list_descendants(process.pid))
         # The crate, and the child that imports.
         assert len(family) == 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 from collections.abc import Iterator
 
 import pytest
@@ -18,8 +17,8 @@ from rack.boards.errors import ConfigError
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
-from tests.processes import RACK, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.processes import RACK, start_rack, wait_until
+from tests.tools.command_line import BOUND_S, rack
 
 TASKS = "wave, wave.planner, watch, driven, clock"
 
@@ -32,19 +31,14 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
     # A machine that is busy must not use the restarts up.
     settings = ["--set", f"name={name}", "--set", "supervision.restarts=1000"]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([*command, *settings], cwd=ROOT, **pipes, text=True)
+    process = start_rack([*command, *settings], name, path.with_suffix(".log"))
     try:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith(name) and "tick 0 " not in line:
-                break
         yield name
         assert rack("stop", name).returncode == 0
-        process.communicate(timeout=BOUND_S)
+        process.wait(BOUND_S)
     finally:
         process.kill()
-        process.communicate()
+        process.wait()
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from rack.boards.config import load
 from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
+from rack.tools.console import interrupt
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
@@ -35,7 +36,7 @@ from tests.tools.machines import A, B, recorded
 pytestmark = pytest.mark.thorough
 
 ROOT = Path(__file__).resolve().parents[2]
-WATCHDOG_S = 50.0
+WATCHDOG_S = 100.0
 
 
 @pytest.mark.slow
@@ -76,8 +77,11 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
 ) -> None:
     run, saved = tmp_path / "run", tmp_path / "saved"
     settings = ["--set", f"name={rack_name}", "--set", "clock.mode=realtime", "--out", str(run)]
+    # The rings hold two seconds of simulated time: at this speed a recorder that is late loses
+    # nothing.
+    settings += ["--set", "clock.speed=0.2"]
     with subprocess.Popen(
-        [*RACK, "run", str(small), "--seconds", "60", "--json", *settings],
+        [*RACK, "run", str(small), "--json", *settings],
         stdout=subprocess.DEVNULL,
     ) as process:
         try:
@@ -91,7 +95,9 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
         finally:
             # Not by a signal, which ends it in a hurry.
             subprocess.run([*RACK, "stop", rack_name], capture_output=True, timeout=WATCHDOG_S)
-    assert (done.returncode, done.stderr) == (0, "")
+    # On a slow machine it says how far it is.
+    said = [line for line in done.stderr.splitlines() if not line.startswith("merging the rec")]
+    assert (done.returncode, said) == (0, [])
     assert re.search(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", status.stdout)
     answer = json.loads(done.stdout)
     files = [path for path in saved.rglob("*") if path.is_file() and path.name != CHECKSUMS]
@@ -100,7 +106,8 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
     assert not any(whole.lost_rows.values())
     ticks = part.read_signal("lower.status", "tick")
     traced = np.concatenate([rows["tick"] for rows in part.cycles.values()]) * 0.0025
-    assert answer["since_s"] == pytest.approx(traced.min())
+    # From the start, also when a late clock has skipped the first ticks.
+    assert answer["since_s"] == 0.0
     assert answer["until_s"] == pytest.approx(traced.max())
     assert 0 < answer["until_s"] < 0.0025 * whole.end_counts["outcome"]["ticks"]
     for name in ("lower", *part.mailboxes):
@@ -205,15 +212,22 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
         recorder = stack.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes))
         stack.callback(recorder.kill)
         wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
+        sent_s = time.monotonic()
         send(recorder.pid, number)
         out, said = recorder.communicate(timeout=WATCHDOG_S)
+        took_s = time.monotonic() - sent_s
     assert recorder.returncode == 128 + number, said
+    is_finished = not any((each / "recorder.spool").exists() for each in folders)
+    for each in folders:
+        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
+    if not out:
+        # On a slow machine the time for an end in order does not suffice.
+        assert took_s > interrupt.BOUND_S
+        return
     notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' creates it"] if count > 1 else []
     assert json.loads(out)["notes"] == notes
     assert (folder / "run.rrd").exists() == (count == 1)
-    for each in folders:
-        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
-        assert not (each / "recorder.spool").exists()
+    assert is_finished
 
 
 def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_fault_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
         rack.live.withdraw_fault(0)
 
 
-@pytest.mark.timeout(20)
+@pytest.mark.timeout(60)
 def test_a_fault_is_withdrawn_at_once_from_a_held_rack(
     rack: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:

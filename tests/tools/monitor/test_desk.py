@@ -18,28 +18,22 @@ from rack.backplane.words import System
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.processes import RACK, wait_until
+from tests.processes import RACK, start_rack, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
-def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
+def start(path: Path, name: str, *settings: str) -> subprocess.Popen[bytes]:
     """Start a rack that runs until it is stopped, and return when it runs."""
     path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(command, cwd=ROOT, **pipes, text=True)
-    assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith(name) and "tick 0 " not in line:
-            break
-    return process
+    return start_rack(command, name, path.with_suffix(".log"))
 
 
-def end(process: subprocess.Popen[str], name: str) -> None:
+def end(process: subprocess.Popen[bytes], name: str) -> None:
     rack("stop", name)
     process.kill()
-    process.communicate()
+    process.wait()
 
 
 @pytest.fixture(scope="module", params=["realtime", "lockstep"])
@@ -48,9 +42,11 @@ def running(
 ) -> Iterator[str]:
     """Name of a rack that runs until it is stopped."""
     name = f"test-command-{request.param}-{os.getpid()}"
-    process = start(
-        tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}"
-    )
+    # An operator is silent after a second of simulated time: a process of a busy machine must not
+    # be.
+    slow = ("clock.speed=0.25",) if request.param == "realtime" else ()
+    settings = (f"clock.mode={request.param}", *slow)
+    process = start(tmp_path_factory.mktemp("rack") / "told.toml", name, *settings)
     yield name
     end(process, name)
 

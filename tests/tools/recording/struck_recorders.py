@@ -121,8 +121,9 @@ def counts(recording: Recording) -> dict[str, int]:
     return rows | {name: len(recording.read_signal(name, "serial")) for name in recording.mailboxes}
 
 
-def realtime(config: RackConfig) -> RackConfig:
-    return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})
+def realtime(config: RackConfig, speed: float = 1.0) -> RackConfig:
+    changes = {"mode": "realtime", "speed": speed}
+    return config.model_copy(update={"clock": config.clock.model_copy(update=changes)})
 
 
 class EndingView:

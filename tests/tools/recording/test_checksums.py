@@ -30,7 +30,7 @@ from rack.tools.report.report import write_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
-BOUND_S = 30
+BOUND_S = 100
 """Bound of a command on a damaged run."""
 SIGNALS = "signals/*/*"
 FLIPS = 15

@@ -20,7 +20,7 @@ from rack.tools.monitor.display import Display
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recording import Recording
 from tests.processes import children_of
-from tests.tools.command_line import rack
+from tests.tools.command_line import BOUND_S, rack
 from tests.tools.recording.struck_recorders import (
     LONG_S,
     FillingDisk,
@@ -125,7 +125,7 @@ def test_a_small_disk_ends_the_run_with_one_line_and_leaves_no_process(
         *("--set", f"name={rack_name}", "--set", f"clock.mode={mode}"),
         *("--seconds", str(5 * LONG_S), "--out", disk / "run"),
     )
-    done = subprocess.run(command, capture_output=True, text=True, timeout=2 * FULL_S, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=BOUND_S, check=False)
     assert done.returncode == 1, done
     *_, last = done.stderr.splitlines()
     assert last.startswith(f"{disk}/run: No space left on device")

@@ -11,7 +11,9 @@ import select
 import signal
 import subprocess
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from rerun.chunk import RrdReader
@@ -21,6 +23,7 @@ from rack.backplane.words import Run, System
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.parts import FILE, list_parts
 from tests.conftest import SMALL
+from tests.machine import run_undisturbed
 from tests.processes import RACK, children_of, wait_until
 
 pytestmark = [
@@ -42,6 +45,8 @@ RUN_S = 4.0
 LATEST_S = 2.5
 """Instants of the kill, simulated time."""
 BOUND_S = 60.0
+IN_TIME = 80
+"""Ticks by which a recorder that has its share of the machine is behind at most: 0.2 s."""
 
 
 def list_process_family(pid: int) -> list[int]:
@@ -49,13 +54,22 @@ def list_process_family(pid: int) -> list[int]:
     return [pid, *(one for child in children_of(pid) for one in list_process_family(child))]
 
 
-def count_ticks_lost_by_a_kill(
-    folder: Path, name: str, victim: str, seed: int, record: str = ""
-) -> int:
-    """Run the small rack in real time, and kill at a random instant.
+class Killed(NamedTuple):
+    """A run that was killed, in ticks of its fastest task.
 
-    Returns the number of rows of its fastest task that were written by that instant but are not in
-    the files. All tables are opened. `record` is a table of its config.
+    `lost` are the rows written by that instant that are not in the files. `behind` says how far the
+    recorder was behind the clock then, and `skipped` how many ticks a late clock had skipped.
+    """
+
+    lost: int
+    behind: int
+    skipped: int
+
+
+def kill_run(folder: Path, name: str, victim: str, seed: int, record: str = "") -> Killed:
+    """Run the small rack in real time, kill at a random instant, and open all tables.
+
+    `record` is a table of its config.
     """
     folder.mkdir(exist_ok=True)
     (folder / "small.toml").write_text(SMALL + record)
@@ -79,7 +93,8 @@ def count_ticks_lost_by_a_kill(
             "launcher": [process.pid],
             "all": list_process_family(process.pid),
         }
-        tick = segment.words[System.TICK]
+        tick, skipped = segment.words[System.TICK], segment.words[System.CLOCK_SKIPPED]
+        behind = tick - segment.words[System.FOLLOWER_TICK]
         for pid in struck[victim]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -105,7 +120,8 @@ def count_ticks_lost_by_a_kill(
             if "No recording store found" not in str(error):
                 raise
     newest = int(recording.read_trace("lower")["tick"][-1])
-    return recording.lost_rows.get("lower", 0) + max(0, tick - 1 - newest)
+    lost = recording.lost_rows.get("lower", 0) + max(0, tick - 1 - newest)
+    return Killed(lost, behind, skipped)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +132,13 @@ def count_ticks_lost_by_a_kill(
 def test_a_kill_costs_at_most_a_second_and_every_table_opens(
     tmp_path: Path, rack_name: str, victim: str, record: str
 ) -> None:
-    assert (
-        count_ticks_lost_by_a_kill(tmp_path, rack_name, victim, seed=2, record=record)
-        <= TICKS_A_SECOND
+    folders = (tmp_path / str(number) for number in count())
+
+    def find_disturbance(run: Killed) -> str:
+        is_quiet = run.behind <= IN_TIME and run.skipped <= IN_TIME
+        return "" if is_quiet else f"{run.behind} ticks unread, {run.skipped} skipped"
+
+    run = run_undisturbed(
+        lambda: kill_run(next(folders), rack_name, victim, seed=2, record=record), find_disturbance
     )
+    assert run.lost <= TICKS_A_SECOND

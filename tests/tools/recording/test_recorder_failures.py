@@ -41,7 +41,7 @@ from tests.tools.recording.struck_recorders import (
 
 pytestmark = pytest.mark.thorough
 
-WATCHDOG_S = 30.0
+WATCHDOG_S = 60.0
 
 
 @pytest.fixture
@@ -79,8 +79,9 @@ def test_a_stopped_recorder_is_replaced_without_losing_rows(
 ) -> None:
     display: AtTick = Held(config.name, signal.SIGSTOP)
     if mode == "realtime":
-        # The rings hold two seconds, which is the whole run.
-        display, config = AtTick(signal.SIGSTOP), realtime(config)
+        # The rings hold two seconds, which is the whole run. It is slow, so that the display comes
+        # to look before its end.
+        display, config = AtTick(signal.SIGSTOP), realtime(config, speed=0.25)
     seconds = LONG_S if mode == "lockstep" else 2.0
     result = run_rack(config, seconds, tmp_path / "run", display, step=mode == "lockstep")
     assert display.struck
@@ -97,8 +98,9 @@ def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
-    config = config if mode == "lockstep" else realtime(config)
-    result = run_rack(config, 3.0, tmp_path / "run", Display())
+    # The rings hold two seconds, which is the whole run, however late the recorder is.
+    seconds, config = (3.0, config) if mode == "lockstep" else (1.5, realtime(config))
+    result = run_rack(config, seconds, tmp_path / "run", Display())
     assert (result.worked, result.recording) == (True, "complete")
     notes = notes_of(Recording(tmp_path / "run"))
     assert notes[0] == NO_RECORDER

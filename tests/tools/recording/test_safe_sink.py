@@ -10,7 +10,7 @@ import pytest
 
 from rack.tools.recording.recorder.recorder import SafeSink
 
-WATCHDOG_S = 30.0
+WATCHDOG_S = 60.0
 
 
 class Failing:

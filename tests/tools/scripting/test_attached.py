@@ -18,16 +18,15 @@ from rack.boards import Rack
 from rack.boards.events import Event
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED
-from tests.processes import named, wait_until
+from tests.processes import BOUND_S, named, wait_until
 
-BOUND_S = 20.0
 SCRIPT = """
 import sys
 from rack import Rack, attach
 
 with Rack.from_file({path!r}, ["name={name}"]) as own, attach({name!r}) as live:
     own.run_in_background()
-    live.wait_until("lower.status.count > 100", timeout_s=20)
+    live.wait_until("lower.status.count > 100", timeout_s=50)
     print("runs", flush=True)
     {then}
 """
