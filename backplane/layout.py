@@ -74,7 +74,8 @@ class InterruptSpec:
     All times are counted by the clock of this rack.
 
     Attributes:
-        sent_ns: Time from the release of the writing cycle until its message is sent.
+        sent_ns: Time from the release of the writing cycle until its message is sent, which is its
+            worst-case response.
         service_ns: Time that an interrupt handler takes to serve one message.
         depth: Maximum number of messages that wait for a handler.
         due: Number of ticks after the release within which the message must be in memory.
@@ -312,14 +313,14 @@ class Layout:
     def compute_due_ticks(self, task: TaskSpec) -> int:
         """Return the number of ticks after a release within which a task must write.
 
-        This is its period, or less if one of its messages must be sent earlier by interrupt.
+        This is its time slice, or less if one of its messages must be sent earlier by interrupt.
         """
         sent = [
             m.interrupt.due
             for m in self.mailboxes
             if m.writer == task.name and m.interrupt is not None
         ]
-        return min([task.every, *sent])
+        return min([task.slice, *sent])
 
     def list_interrupting_mailboxes(self, slot: int) -> list[MailboxSpec]:
         """Return the mailboxes that interrupt the board in a slot, sorted by writer slot."""

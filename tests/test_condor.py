@@ -18,7 +18,7 @@ from rack.backplane.message import Message
 from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import build_rack_timing, load, resolve_layout
-from rack.boards.timing.verdicts import PREEMPTED, evaluate_rack
+from rack.boards.timing.verdicts import evaluate_rack
 from rack.levels.systems.hand.messages import GraspKind
 from rack.tools.recording.recording import Recording
 from tests.processes import wait_until
@@ -85,14 +85,14 @@ def test_handlers_that_preempt_the_fingers_are_predicted_and_make_them_late(
 ) -> None:
     # The order of the coordinator then comes while the fingers compute.
     settings = ["board.coordinator.phase=1"]
-    settings += [f"board.{name}.budget.process_ms=0.9" for name in FINGERS]
-    late = "protocol.interrupt.fixed_us=400"
-    for extra, is_late in (((), False), ((late,), True)):
+    for core, name in enumerate(FINGERS, 2):
+        settings += [f"board.{name}.budget.process_ms=0.9", f"board.{name}.core={core}"]
+    slow = "protocol.interrupt.fixed_us=350"
+    soon = [f"board.{name}.budget.send_within_ms=1.25" for name in FINGERS]
+    for extra, is_late in ((soon, False), ([slow], False), ([slow, *soon], True)):
         config = load("condor", [f"name={rack_name}", "clock.mode=lockstep", *settings, *extra])
         timing = build_rack_timing(config, resolve_layout(config))
-        failed = [
-            v.subject for v in evaluate_rack(timing) if v.equation == PREEMPTED and not v.holds
-        ]
+        failed = [v.subject for v in evaluate_rack(timing) if not v.holds]
         assert failed == list(FINGERS) * is_late
         found = []
         for _ in range(2):

@@ -56,7 +56,7 @@ class ReleasedTask:
         self.deadline = self.block[Block.DEADLINE]
         self._every = spec.every
         self._phase = spec.phase
-        self._early = spec.every - segment.layout.compute_due_ticks(spec)
+        self._early = spec.slice - segment.layout.compute_due_ticks(spec)
         self._done = self.block[Block.DONE]
         self.wake: Callable[[], object] = get_wake_semaphore(segment, spec.name).release
         self.done = get_done_semaphore(segment, spec.name)

@@ -84,12 +84,21 @@ class LayoutBuilder:
     Args:
         wiring: The wiring.
         sizes: Sizes that messages use by name, such as the number of joints.
+
+    Attributes:
+        sent_ns: Times from a release to the sending of interrupts, by executor. For others it is
+            the budget of a cycle, or one tick without a budget.
     """
 
     def __init__(self, wiring: Wiring, sizes: Mapping[str, int]) -> None:
         self._wiring = wiring
         self._config = wiring.config
         self._sizes = sizes
+        self.sent_ns = {
+            name: round(board.budget.send_within_ms * NS_PER_MS)
+            for name, board in wiring.config.board.items()
+            if board.budget is not None and board.budget.send_within_ms is not None
+        }
         self._retained_ticks = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
         self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.ports.values()}
 
@@ -208,12 +217,11 @@ class LayoutBuilder:
         }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
-        # A plan is sent at the end of its slice. Other messages are sent when the budget of the
-        # cycle is used up, or after one tick if there is no budget.
+        # A plan is sent at the end of its slice.
         sent_ns = writer.slice * clock_ns
         if writer.role != "planner":
-            busy_ms = self._config.board[writer.board].busy_ms
-            sent_ns = min(round(busy_ms * NS_PER_MS) or clock_ns, sent_ns)
+            busy_ns = round(self._config.board[writer.board].busy_ms * NS_PER_MS) or clock_ns
+            sent_ns = min(self.sent_ns.get(writer.name, busy_ns), sent_ns)
         slots = tuple(sorted({task.slot for task in readers} - uninterrupted - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
         interrupt = InterruptSpec(

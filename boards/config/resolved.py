@@ -24,6 +24,7 @@ from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
 from rack.boards.config.schedulers import build_scheduling, compute_clock_reservation
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
+from rack.boards.config.sending import settle_sending
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
@@ -228,7 +229,10 @@ class Examination:
             self._sizes = compute_cell_sizes(config)
             self.mistakes += (unknown_sizes := [*check_sizes(wiring, self._sizes)])
             if not unknown_sizes:
-                self._layout = LayoutBuilder(wiring, self._sizes).build_layout()
+                builder = LayoutBuilder(wiring, self._sizes)
+                self._layout = (
+                    builder.build_layout() if self.mistakes else settle_sending(config, builder)
+                )
                 self._contexts = self._build_board_contexts(wiring)
                 self.mistakes += check_memory(self._layout)
                 self.mistakes += check_neighbours(wiring, self._contexts)
@@ -290,6 +294,10 @@ class Examination:
         of_host = self._wiring.host_side_mailboxes
         from_host = self._wiring.mailboxes_from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
+        scheduling = (
+            build_scheduling(self._config, spec.board, spec.every) if is_executor else None
+        )
+        budget_ns = round((board.busy_ms if is_executor else board.planning_ms) * 1e6)
         return TaskWiring(
             task=ports.task,
             target=ports.place.target,
@@ -306,10 +314,8 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            scheduling=(
-                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
-            ),
-            budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
+            scheduling=scheduling,
+            budget_ns=(scheduling.cost_ns if scheduling else 0) or budget_ns,
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

@@ -75,7 +75,6 @@ def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
             name = layout.find_interrupt_task(slot)
             names = tuple(box.name for box in boxes)
             task = layout.find_task(name)
-            due = task.slice if task.role == "planner" else layout.compute_due_ticks(task)
             timings[name] = InboxTiming(
                 name,
                 names,
@@ -83,7 +82,6 @@ def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
                 get_interrupt_spec(boxes[0]).depth,
                 period_ns=task.slice * layout.clock_ns,
                 first_ns=task.phase * layout.clock_ns,
-                due_ns=due * layout.clock_ns,
             )
     return timings
 
@@ -117,7 +115,8 @@ def _build_board_timing(
         name=name,
         above=tuple(upper for upper, lower in config.list_links() if lower == name),
         coupling=board.coupling,
-        every=layout.find_task(name).every,
+        every=(task := layout.find_task(name)).every,
+        due=layout.compute_due_ticks(task),
         within_cycles=board.within_cycles,
         core=board.core,
         priority=board.priority,
@@ -184,7 +183,7 @@ def read_budgets(config: RackConfig) -> dict[str, Budget]:
 def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
     """Return a copy of a config with its budgets replaced by measured ones, keyed by board.
 
-    Boards without a measured budget have none in the copy. `plan_within_ms` is kept.
+    Boards without a measured budget have none in the copy. Limits are kept.
     """
     boards = {}
     for name, board in config.board.items():
@@ -193,7 +192,7 @@ def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackC
             times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(measured[name]).items()}
             if board.planner is None:
                 times = {key: ms for key, ms in times.items() if key not in PLANNER_BUDGET}
-            within_ms = None if board.budget is None else board.budget.plan_within_ms
-            budget = BudgetConfig(**times, plan_within_ms=within_ms)
+            limits = board.budget or BudgetConfig()
+            budget = limits.model_copy(update=times)
         boards[name] = board.model_copy(update={"budget": budget})
     return config.model_copy(update={"board": boards})

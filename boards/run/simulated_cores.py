@@ -112,7 +112,7 @@ class SimulatedCores:
                     task.spec.priority,
                     self._loads[name].is_critical,
                     ready_at,
-                    deadline_ns=(release + task.spec.every) * self._clock_ns,
+                    deadline_ns=task.deadline * self._clock_ns,
                     left_ns=block[Block.COMPUTING_NS],
                 )
             )

@@ -199,7 +199,7 @@ class InterruptHandler:
     the first task of the board takes the time of the handler at the end of its computation, before
     it writes: for the messages that were being served at the release, and for those that have
     arrived since then. In lockstep this is simulated time, in which the cycle takes its budget, and
-    messages arrive when their writers' cycles and budgets say. Between two computations the handler
+    messages arrive when the responses of their writers say. Between two computations the handler
     takes the time of nothing.
     """
 

@@ -32,7 +32,6 @@ class InboxTiming:
         depth: Largest number of pending interrupts.
         period_ns: Time between two computations of the task.
         first_ns: Time of the first of them.
-        due_ns: Time after its begin at which a computation must have ended.
     """
 
     task: str
@@ -41,7 +40,6 @@ class InboxTiming:
     depth: int
     period_ns: int
     first_ns: int
-    due_ns: int
 
     def compute_cost_ns(self, time_ns: int) -> int:
         """Return the longest time in ns that handlers take from a computation of `time_ns`.

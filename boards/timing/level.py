@@ -21,6 +21,8 @@ class BoardTiming:
         above: Boards directly above it. The relation holds if either board names the other.
         coupling: How executor and planner share processors.
         every: Period of the executor in ticks.
+        due: Ticks from a release within which its cycle must end: its period, or less if it sends
+            interrupts.
         within_cycles: Cycles that a plan may take.
         core: Core that the config requests for the executor.
         priority: SCHED_FIFO priority of the executor.
@@ -41,6 +43,7 @@ class BoardTiming:
     above: tuple[str, ...]
     coupling: Coupling
     every: int
+    due: int
     within_cycles: int
     core: int
     priority: int

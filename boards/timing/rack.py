@@ -187,11 +187,24 @@ class RackTiming:
 
     @cached_property
     def _interrupted_ns(self) -> dict[str, int]:
-        """Time that interrupts take from one computation of each task that serves an inbox."""
-        return {
-            task: inbox.compute_cost_ns(self.find_busy_ns(task))
-            for task, inbox in self.inboxes.items()
-        }
+        """Time that interrupts take from one computation of each task that serves an inbox.
+
+        The computation lasts longer if the task waits for its core, which depends on the handlers
+        of all tasks. Both times are raised until they agree. The cost of each inbox is bounded.
+        """
+        lasting_ns = {task: self.find_busy_ns(task) for task in self.inboxes}
+        while True:
+            taken_ns = {
+                task: inbox.compute_cost_ns(lasting_ns[task])
+                for task, inbox in self.inboxes.items()
+            }
+            before_ns = dict(lasting_ns)
+            for each in self._compute_responses(taken_ns) if taken_ns else ():
+                if each.task in taken_ns and each.response_ns is not None:
+                    computing_ns = each.response_ns - taken_ns[each.task]
+                    lasting_ns[each.task] = max(before_ns[each.task], computing_ns)
+            if lasting_ns == before_ns:
+                return taken_ns
 
     def find_busy_ns(self, task: str) -> int:
         """Return the budget of a task's cycle or plan in ns, without interrupts. 0 without one."""
@@ -215,13 +228,17 @@ class RackTiming:
     @cached_property
     def tasks(self) -> tuple[TimedTask, ...]:
         """The clock, if its cost is known, and the tasks of every board that has a budget."""
-        clock = (self.clock,) if self.clock.cost_ns else ()
-        return (
-            *clock,
-            *(task for board in self.boards.values() for task in self._build_tasks(board)),
-        )
+        return self._build_tasks(self._interrupted_ns)
 
-    def _build_tasks(self, board: BoardTiming) -> list[TimedTask]:
+    def _build_tasks(self, taken_ns: Mapping[str, int]) -> tuple[TimedTask, ...]:
+        """Return the tasks if interrupts take `taken_ns` from a computation of each task."""
+        clock = (self.clock,) if self.clock.cost_ns else ()
+        boards = self.boards.values()
+        return (*clock, *(t for board in boards for t in self._build_board_tasks(board, taken_ns)))
+
+    def _build_board_tasks(
+        self, board: BoardTiming, taken_ns: Mapping[str, int]
+    ) -> list[TimedTask]:
         """Return the executor and any planner of a board. Empty without a budget."""
         budget = board.budget
         if budget is None:
@@ -234,10 +251,11 @@ class RackTiming:
             priority=board.priority,
             every_ns=board.every * self.tick_ns,
             phase_ns=board.phase * self.tick_ns,
+            due_ns=board.due * self.tick_ns,
             parts=_drop_empty_parts(
                 Part(Unit.EXCHANGE, board.exchange_ns),
                 Part(Unit.READ, budget.read_ns),
-                Part(Unit.PROCESS, budget.process_ns + self.compute_interrupted_ns(board.name)),
+                Part(Unit.PROCESS, budget.process_ns + taken_ns.get(board.name, 0)),
                 Part(Unit.WRITE, budget.write_ns),
             ),
         )
@@ -251,12 +269,11 @@ class RackTiming:
             core=board.planner_core,
             priority=board.planner_priority,
             parts=_drop_empty_parts(
-                Part(
-                    Unit.PLAN, budget.plan_ns + self.compute_interrupted_ns(f"{board.name}.planner")
-                ),
+                Part(Unit.PLAN, budget.plan_ns + taken_ns.get(f"{board.name}.planner", 0)),
                 Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
             ),
             within_cycles=board.within_cycles,
+            due_ns=0,
             ceiling=ceiling,
         )
         return [executor, planner]
@@ -278,7 +295,11 @@ class RackTiming:
     @cached_property
     def responses(self) -> tuple[TaskResponse, ...]:
         """Worst-case response of every task that has a cost."""
-        return compute_task_responses(self.tasks, self.context_switch_ns)
+        return self._compute_responses(self._interrupted_ns)
+
+    def _compute_responses(self, taken_ns: Mapping[str, int]) -> tuple[TaskResponse, ...]:
+        """Return the responses if interrupts take `taken_ns` from a computation of each task."""
+        return compute_task_responses(self._build_tasks(taken_ns), self.context_switch_ns)
 
     @cached_property
     def loads(self) -> dict[int, float]:

@@ -105,7 +105,7 @@ def _compute_scheduled_responses(
     Returns:
         The times in ns, keyed by task. Empty if the schedule is too long or not exact. It is not
         exact if there are planners, which may plan at any release, if tasks of equal priority wait
-        at the same time, so that their order is not fixed, or if a deadline is missed.
+        at the same time, so that their order is not fixed, or if a job outlasts its period.
     """
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
@@ -115,16 +115,17 @@ def _compute_scheduled_responses(
         return {}
     single_part_tasks = [merge_parts(task, context_switch_ns) for task in tasks]
     chart = simulate_schedule(single_part_tasks, until + max(task.period_ns for task in tasks))
-    priorities = {task.name: task.priority for task in tasks}
+    by_name = {task.name: task for task in tasks}
     intervals = defaultdict[int, list[tuple[int, int]]](list)
-    responses = dict.fromkeys(priorities, 0)
+    responses = dict.fromkeys(by_name, 0)
     for job in chart.jobs:
         if job.release_ns >= until:
             continue
-        if job.end_ns is None or job.end_ns > job.deadline_ns:
+        task = by_name[job.task]
+        if job.end_ns is None or job.end_ns > job.release_ns + task.period_ns:
             return {}
         responses[job.task] = max(responses[job.task], job.end_ns - job.release_ns)
-        intervals[priorities[job.task]].append((job.release_ns, job.end_ns))
+        intervals[task.priority].append((job.release_ns, job.end_ns))
     is_order_open = any(
         later[0] < earlier[1]
         for jobs in intervals.values()
@@ -205,7 +206,7 @@ def compute_task_responses(
                 job_ns=job,
                 blocking_ns=blocking,
                 response_ns=exact.get(task.name, bound),
-                deadline_ns=task.period_ns,
+                deadline_ns=task.deadline_ns,
             )
         )
     return tuple(responses)

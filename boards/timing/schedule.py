@@ -265,4 +265,4 @@ class _TaskSimulation:
         if self._release not in self._ends and self._release >= 0:
             self._ends[self._release] = None
         for release, end in self._ends.items():
-            yield Job(self.task.name, release, release + self.task.period_ns, end)
+            yield Job(self.task.name, release, release + self.task.deadline_ns, end)

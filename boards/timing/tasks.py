@@ -81,6 +81,7 @@ class TimedTask:
         ceiling: Priority of the parts that are not preemptible. A plan update blocks its executor
             and every task that has no higher priority than the executor (eq. 3.10).
         phase_ns: Time of the first release.
+        due_ns: Time from a release within which its job must end. 0 for `period_ns`.
     """
 
     name: str
@@ -93,11 +94,17 @@ class TimedTask:
     within_cycles: int = 1
     ceiling: int = 0
     phase_ns: int = 0
+    due_ns: int = 0
 
     @property
     def period_ns(self) -> int:
-        """Shortest time in ns between the releases of two jobs, which is also a job's deadline."""
+        """Shortest time in ns between the releases of two jobs."""
         return self.every_ns * self.within_cycles
+
+    @property
+    def deadline_ns(self) -> int:
+        """Time in ns from a release to the deadline of its job."""
+        return self.due_ns or self.period_ns
 
     @property
     def cost_ns(self) -> int:

@@ -56,12 +56,12 @@ def compute_communication_ns(rows: TraceRows) -> Values:
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
-def compute_residual_ns(rows: TraceRows, slice_ns: int) -> Values:
+def compute_residual_ns(rows: TraceRows, due_ns: int) -> Values:
     """Return t_residual: the time in ns from the end of each cycle to its deadline.
 
-    It is negative if the deadline was missed. The deadline is `slice_ns` after the release.
+    It is negative if the deadline was missed. The deadline is `due_ns` after the release.
     """
-    return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
+    return np.asarray(rows["release_ns"] + due_ns - rows["end_ns"])
 
 
 def compute_gaps_ns(rows: TraceRows, stretches: Values | None = None) -> Values:

@@ -38,10 +38,9 @@ RESPONSE_TIME = "response time"
 LOAD = "load"
 FRAMES = "frames"
 INBOX = "inbox"
-PREEMPTED = "preempted"
 """Criteria that are not in the paper."""
 EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
-BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX, PREEMPTED
+BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
 ORDER = (*EQUATIONS, *BEYOND)
 """All equations and criteria, in the order of the verdicts."""
 
@@ -240,12 +239,8 @@ def _check_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def _check_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield verdicts on each inbox: messages that wait, and the computation that they preempt."""
+    """Yield a verdict on each inbox: whether it has room for the messages that wait."""
     for name, inbox in rack.inboxes.items():
-        if busy_ns := rack.find_busy_ns(name):
-            preempted_ns = busy_ns + rack.compute_interrupted_ns(name)
-            meaning = "computation and handlers that preempt it < deadline"
-            yield EquationVerdict(PREEMPTED, name, preempted_ns, "<", inbox.due_ns, meaning)
         burst = inbox.burst
         most_waiting = inf
         endless = f"interrupts of '{name}' come faster than it serves them (load {burst.load:.3g})"

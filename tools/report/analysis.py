@@ -229,7 +229,7 @@ def _judge_tasks(
             step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
-            deadline_ns = compute_slice_ns(rack, cycles.task)
+            deadline_ns = compute_due_ns(rack, cycles.task)
             # A cycle that the trace marks as missed counts as later than its deadline, even if its
             # measured response is shorter.
             least_ns = np.where(trace_times.find_missed_cycles(rows), deadline_ns + 1, 0)
@@ -273,9 +273,10 @@ def compute_cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
     return rack.boards[task.board].every * rack.tick_ns
 
 
-def compute_slice_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return the time slice of a task in wall-clock ns.
+def compute_due_ns(rack: RackTiming, task: TaskSpec) -> int:
+    """Return the time in wall-clock ns from a release of a task to its deadline.
 
-    It is R_i for an executor, and d R_i for a planner whose plans take d cycles.
+    For a planner it is d R_i. For an executor it is R_i, or less if it sends interrupts.
     """
-    return task.slice * rack.tick_ns
+    due = task.slice if task.role == "planner" else rack.boards[task.board].due
+    return due * rack.tick_ns

@@ -63,6 +63,7 @@ def add_causes(
 def _find_delays(recording: Recording, task: TaskSpec, absent: Mapping[int, Occupation]) -> Causes:
     """Find the causes of a task's lost cycles in the times of its core and of its trace."""
     rows = recording.read_trace(task.name)
+    due = recording.layout.compute_due_ticks(task)
     core, _ = recording.find_core_and_priority(task)
     grid_ns = recording.rack_config.tick_ns
     skipped = count_skipped_releases(rows)
@@ -77,7 +78,7 @@ def _find_delays(recording: Recording, task: TaskSpec, absent: Mapping[int, Occu
     found = {
         HYPERVISOR: Occupation(*spans[spans[:, 2] == core, :2].T).compute_overlap(since, until),
         CORE_TAKEN: absent[core].compute_overlap(since, until) if len(rows) else since,
-        OWN_EXECUTION: np.where(own_ns > task.slice * grid_ns, own_ns, 0),
+        OWN_EXECUTION: np.where(own_ns > due * grid_ns, own_ns, 0),
     }
     causes: Causes = {}
     for why, ns in found.items():

@@ -200,7 +200,14 @@ def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) 
     entry = {
         **_describe_task(task, layout),
         **counts,
-        **compute_task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
+        **compute_task_times(
+            task,
+            cycles,
+            period_ns,
+            is_lockstep,
+            stretches=stretches,
+            due_ns=layout.compute_due_ticks(task) * period_ns,
+        ),
     }
     if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:
         entry["plan_age_ms"] = compute_distribution(compute_plan_ages_ms(recording, task.board))

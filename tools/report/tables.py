@@ -12,7 +12,12 @@ from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
 from rack.tools.recording.history import summarize_gaps
-from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
+from rack.tools.report.analysis import (
+    MOST_CYCLES_PERCENTILE,
+    Analysis,
+    EquationPair,
+    compute_due_ns,
+)
 from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
 from rack.tools.timing.summary import find_tightest, format_margin
 from rack.tools.timing.tables import build_level_table, build_verdict_table
@@ -106,6 +111,7 @@ def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
             rack.tick_ns,
             rack.is_lockstep,
             stretches=cycles.stretches[judged],
+            due_ns=compute_due_ns(rack, cycles.task),
             parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
         ),
     }

@@ -155,7 +155,13 @@ class RackWriter:
             task.name: [
                 partial(self._hierarchy.write, task.name),
                 cycles[task.name].write,
-                *build_load_curves(stream, task, colours[task.name], tick_ns, lockstep),
+                *build_load_curves(
+                    stream,
+                    task,
+                    colours[task.name],
+                    layout.compute_due_ticks(task) * tick_ns,
+                    lockstep,
+                ),
                 build_miss_lines(stream, task),
             ]
             for task in layout.tasks

@@ -114,22 +114,21 @@ def choose_task_colours(layout: Layout, boards: Sequence[str]) -> dict[str, Colo
 
 
 def build_load_curves(
-    stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
+    stream: Stream, task: TaskSpec, colour: Colour, due_ns: int, is_lockstep: bool
 ) -> Iterator[ViewPart]:
     """Yield the view parts that show the times of a task as curves.
 
-    These are lateness, execution time and deadline in ms, and the used part of the time slice in
-    percent, where 100 % is the deadline. In lockstep a tick lasts as long as its tasks take, so
+    These are lateness, execution time and deadline in ms, and the used part of the time until the
+    deadline in percent. In lockstep a tick lasts as long as its tasks take, so
     only the execution time is shown, in ms and in percent.
 
     Args:
         stream: Stream to write to.
         task: The task.
         colour: Colour of the task.
-        period_ns: Length of a tick on the wall clock.
+        due_ns: Time from a release to the deadline on the wall clock.
         is_lockstep: Whether the run is in lockstep.
     """
-    slice_ns = task.slice * period_ns
 
     def times_ms(block: RowBlock) -> np.ndarray:
         """Return lateness, execution time and deadline of each cycle in ms, shape (rows, 3)."""
@@ -138,7 +137,7 @@ def build_load_curves(
         columns[:, 1] = compute_execution_ns(rows) * 1e-6
         if not is_lockstep:
             columns[:, 0] = compute_lateness_ns(rows) * 1e-6
-            columns[:, 2] = slice_ns * 1e-6
+            columns[:, 2] = due_ns * 1e-6
         return columns
 
     names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
@@ -147,7 +146,7 @@ def build_load_curves(
     yield build_curves(
         stream,
         (LOAD, task.name),
-        lambda block: compute_used_ns(block.rows) * (100.0 / slice_ns),
+        lambda block: compute_used_ns(block.rows) * (100.0 / due_ns),
         [f"{task.name}, %"],
         [colour],
     )

@@ -18,7 +18,12 @@ from rack.boards.timing.verdicts import INBOX, evaluate_rack
 from tests.boards.run.test_interrupts import BOARDS, RACK
 
 INTERRUPT = "protocol.default=interrupt"
-LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=9")
+LOOSE = (
+    "board.lower.coupling=loose",
+    "board.lower.planner_slot=9",
+    "board.lower.planner_core=1",
+)
+"""The planner does not share the core of the executor."""
 
 
 def layout_of(small: Path, *settings: str) -> Layout:
@@ -33,9 +38,15 @@ def sent(box: MailboxSpec) -> tuple[int, int, int]:
     return box.interrupt.sent_ns, box.interrupt.due, box.delay
 
 
-def test_a_message_is_sent_after_the_budget_of_its_cycle(small: Path) -> None:
+def test_a_message_is_sent_after_the_response_of_its_writer(small: Path) -> None:
     budget = "board.upper.budget={ read_ms = 0.5, process_ms = 2.0, write_ms = 0.6 }"
-    assert sent(layout_of(small, budget).find_mailbox("upper.command")) == (3_100_000, 2, 2)
+    alone = "board.upper.core=1"
+    layout = layout_of(small, budget, alone)
+    timing = build_rack_timing(load(small, [INTERRUPT, budget, alone]), layout)
+    (response,) = timing.responses
+    # The handlers of 'lower' may take time from it, and it is switched to and from.
+    assert response.response_ns == 3_100_000 + 200_000 + timing.compute_interrupted_ns("upper")
+    assert sent(layout.find_mailbox("upper.command")) == (response.response_ns, 2, 2)
     # Without a budget after a tick, so it is served in the next one.
     assert sent(layout_of(small).find_mailbox("upper.command")) == (2_500_000, 1, 2)
     over = "board.upper.budget.process_ms=1000"

@@ -143,7 +143,7 @@ def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -
 
 def test_interrupts_that_never_end_are_described_in_a_sentence() -> None:
     source = InterruptSource(1_000, 2_000)
-    inbox = InboxTiming("low", ("up.status",), (source,), 4, 1_000, 0, 1_000)
+    inbox = InboxTiming("low", ("up.status",), (source,), 4, 1_000, 0)
     timing = JudgedConfig.judge(load("fig2")).timing
     board = next(iter(timing.boards))
     timing = replace(timing, inboxes={board: replace(inbox, task=board)})

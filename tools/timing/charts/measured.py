@@ -187,7 +187,6 @@ class _TaskTrace(NamedTuple):
     def list_jobs(self) -> Iterator[Job]:
         """Yield the jobs. A release that an executor skipped is a job without an end."""
         every = self.task.every_ns
-        period = self.task.period_ns
         skipped_counts = count_skipped_releases(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(
             self._compute_times("release_ns"),
@@ -199,7 +198,7 @@ class _TaskTrace(NamedTuple):
                 yield Job(
                     self.task.name, release - before * every, release - (before - 1) * every, None
                 )
-            yield Job(self.task.name, release, release + period, end)
+            yield Job(self.task.name, release, release + self.task.deadline_ns, end)
 
     def list_units(self) -> Iterator[tuple[int, Unit, Stretch]]:
         """Yield the release, unit function and stretch of every computation."""

@@ -26,7 +26,7 @@ from rack.tools.recording.cycles import Cycles
 from rack.tools.recording.divergence import Difference, find_first_difference
 from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
-from rack.tools.report.analysis import Analysis, compute_slice_ns
+from rack.tools.report.analysis import Analysis, compute_due_ns
 
 NAME = "nasrem"
 TASK_S = 34.0
@@ -129,7 +129,7 @@ def _summarize_executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
         cycles=len(rows),
         missed=sum(count_misses_and_skips(rows)),
         done=len(cycles.rows),
-        slice_ms=compute_slice_ns(rack, cycles.task) * MS,
+        slice_ms=compute_due_ns(rack, cycles.task) * MS,
         # Use all cycles, because a cycle that was prolonged by a stall leaves a gap as well.
         largest_gap_ms=float(compute_gaps_ns(cycles.rows).max()) * MS,
         communication_us=sum(float(np.median(part_ns[is_judged])) for part_ns in parts_ns) * US,
