@@ -56,7 +56,8 @@ dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into di
 lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header \
-		--extra can --extra charts --extra dev --extra docs --extra export --extra lab --extra lan --extra live --extra notebook pyproject.toml --output-file requirements.lock
+		--extra can --extra charts --extra dev --extra docs --extra export --extra foxglove --extra lab --extra lan \
+		--extra live --extra notebook --extra perfetto --extra ros2 pyproject.toml --output-file requirements.lock
 
 clean: ## remove the environment and what tools have left; runs/ stays
 	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache
