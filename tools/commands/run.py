@@ -73,6 +73,8 @@ def run(
         "--no-record", "leave no folder: no trace, no signals, no report", False
     ),
     view: View = False,
+    ros2: bool = option("--ros2", "show the rack to nodes of ROS 2; see 'rack bridge'", False),
+    foxglove: bool = option("--foxglove", "show the rack in Foxglove; see 'rack bridge'", False),
     share: bool = option(
         "--share",
         "run even on cores of another rack's real-time boards, although both will be late",
@@ -107,6 +109,7 @@ def run(
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
       rack run nasrem --faults bad-sensors --out runs/sensors
       rack run nasrem --set clock.speed=2 --view
+      rack run nasrem --ros2 --foxglove
       rack run nist-state-table --lockstep --step
       rack run ibm --lockstep --entries runs/ibm-20250101-120000
       rack run nasrem --lockstep --out runs/whole
@@ -162,6 +165,7 @@ def run(
                 view=view,
                 share=share,
                 step=step,
+                bridges=["ros2"] * ros2 + ["foxglove"] * foxglove,
                 beginning=begins,
             )
         report = _report_run(rack_config, folder, result)

@@ -1,0 +1,94 @@
+"""A bridge reads the rings of a running rack, as the recorder does, so no board waits for it.
+
+The bridges in `BRIDGES` are known by name. Any other subclass of `Bridge` is given as
+"package.module:Class", for example to `rack bridge`. It is imported only when it is used.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from typing import ClassVar
+
+import numpy as np
+
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.levels.references import find_class
+from rack.tools.console.answer import Failure
+from rack.tools.monitor.polling import poll_run
+from rack.tools.recording.spool import open_rings
+
+BRIDGES = {
+    "ros2": "rack.tools.ros2.bridge:Ros2Bridge",
+    "foxglove": "rack.tools.foxglove.bridge:FoxgloveBridge",
+}
+"""Class of each bridge. Its name is also that of the extra that installs its libraries."""
+PERIOD_S = 0.02
+"""Time between two readings of the rings. The rings hold 2 s."""
+
+Tell = Callable[[str], None]
+"""Function that shows the user a line."""
+
+
+class Bridge(ABC):
+    """A connection of one rack to another tool.
+
+    The constructor opens the connection. It raises `Failure` if that is not possible.
+
+    Args:
+        segment: The rack.
+        tell: Shows the user a line. The first one reports that the connection is open.
+    """
+
+    rings: Sequence[str] = ()
+    """Tasks and mailboxes whose rows the bridge shows."""
+    period_s: ClassVar[float] = PERIOD_S
+
+    @abstractmethod
+    def __init__(self, segment: Segment, tell: Tell) -> None: ...
+
+    @abstractmethod
+    def show_rows(self, ring: str, rows: np.ndarray) -> None:
+        """Show new rows of a ring, at least one, oldest first."""
+
+    def advance(self, tick: int) -> None:
+        """Continue after all rows written before `tick` have been shown."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection."""
+
+
+def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
+    """Run a bridge until the run of the rack is over, or until a signal.
+
+    Args:
+        name: Name of the bridge, or "package.module:Class".
+        segment: The rack.
+        tell: Shows the user a line.
+
+    Raises:
+        Failure: There is no such bridge, a library is missing, or the connection failed.
+    """
+    try:
+        bridge = find_class(BRIDGES.get(name, name), Bridge)(segment, tell)  # type: ignore[type-abstract]
+    except (ImportError, LookupError) as error:
+        cause = error.__cause__ or error
+        if name in BRIDGES and isinstance(cause, ImportError):
+            raise Failure(f"{cause.name} is missing: pip install 'nasrem-rack[{name}]'") from None
+        known = ", ".join(BRIDGES)
+        raise Failure(f"{error}; known bridges: {known}, or package.module:Class", 2) from None
+    rings = {ring: reader for ring, reader in open_rings(segment).items() if ring in bridge.rings}
+    with closing(bridge):
+        for reader in rings.values():
+            # Begin with the present, not with the two seconds that the rings still hold.
+            reader.read_new_rows()
+        for _ in poll_run(segment, bridge.period_s):
+            tick = segment.words[System.TICK]
+            for ring, reader in rings.items():
+                rows = reader.read_new_rows().rows
+                if len(rows):
+                    bridge.show_rows(ring, rows)
+            bridge.advance(tick)
