@@ -33,7 +33,7 @@ def export(
       rack export runs/nasrem-20250101-120000 --to mcap --out nasrem.mcap
     """
     try:
-        from rack.tools.recording import exchange_file
+        from rack.tools.ecosystem import mcap_json
     except ImportError as error:
         if error.name is None or not error.name.startswith("mcap"):
             raise
@@ -46,7 +46,7 @@ def export(
     partial_file = path.with_name(f"{path.name}.part")
     try:
         with INTERRUPT.raise_interrupted():
-            count = exchange_file.export_recording(
+            count = mcap_json.export_recording(
                 recording, partial_file, create_reading_progress(as_json, "exported")
             )
         partial_file.rename(path)

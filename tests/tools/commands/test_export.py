@@ -88,8 +88,8 @@ def test_a_refused_export_is_reported_in_one_line(
         assert (done.returncode, done.stdout, done.stderr) == (status, "", f"{why}\n")
     assert exported.stat().st_size == size
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    monkeypatch.delitem(sys.modules, "rack.tools.recording.exchange_file")
-    monkeypatch.delattr("rack.tools.recording.exchange_file")
+    monkeypatch.delitem(sys.modules, "rack.tools.ecosystem.mcap_json")
+    monkeypatch.delattr("rack.tools.ecosystem.mcap_json")
     done = rack("export", run, "--out", tmp_path / "x.mcap")
     assert (done.returncode, done.stderr) == (
         1,
