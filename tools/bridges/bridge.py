@@ -73,7 +73,7 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
         Failure: There is no such bridge, a library is missing, or the connection failed.
     """
     try:
-        bridge = find_class(BRIDGES.get(name, name), Bridge)(segment, tell)  # type: ignore[type-abstract]
+        bridge = find_class(BRIDGES.get(name, name), Bridge)(segment, tell)
     except (ImportError, LookupError) as error:
         cause = error.__cause__ or error
         if name in BRIDGES and isinstance(cause, ImportError):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from rack.tools.ecosystem.ros_messages import STORE
+from rack.tools.ros2.topics import Publisher
 
 MAX_BYTES = 1 << 20
 """Longest message that is taken from the network."""
@@ -27,17 +28,6 @@ class RosType(NamedTuple):
 def find_type(name: str) -> RosType:
     """Return a type of `STORE`, or a service."""
     return RosType(name, STORE.hash_rihs01(name))
-
-
-class Publisher(Protocol):
-    """Sends the messages of a topic."""
-
-    @property
-    def has_readers(self) -> bool:
-        """True if anybody receives the messages. Others need not even be encoded."""
-
-    def publish(self, data: bytes) -> None:
-        """Send a message, which is CDR with its encapsulation header."""
 
 
 class Transport(Protocol):

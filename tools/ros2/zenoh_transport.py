@@ -1,8 +1,9 @@
 """ROS 2 over zenoh, with the key expressions, liveliness tokens and attachments of rmw_zenoh.
 
 A topic is the key `DOMAIN/TOPIC/TYPE/HASH`. Other nodes learn of a publisher, subscriber or service
-by its liveliness token, `@ros2_lv/DOMAIN/ZID/NODE/ID/KIND/ENCLAVE/NAMESPACE/NAME/TOPIC/TYPE/HASH/QOS`.
-A message has an attachment: sequence number, time stamp, and the hash of the sender's token.
+by its liveliness token,
+`@ros2_lv/DOMAIN/ZID/NODE/ID/KIND/ENCLAVE/NAMESPACE/NAME/TOPIC/TYPE/HASH/QOS`. A message has an
+attachment: sequence number, time stamp, and the hash of the sender's token.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from xxhash import xxh3_128_intdigest
 from rack.backplane.json_text import encode_json
 from rack.tools.bridges.bridge import Tell
 from rack.tools.console.answer import Failure
+from rack.tools.ros2.topics import Publisher
 from rack.tools.ros2.transport import MAX_BYTES, RosType
 
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
@@ -41,24 +43,6 @@ QOS = "::,10:,:,:,,"
 """Quality of service in a token: reliable, volatile, the last 10 messages."""
 MAX_WAITING = 16
 """Number of messages or requests that wait for `poll`. Older ones are dropped."""
-
-
-class ZenohPublisher:
-    """Sends the messages of a topic."""
-
-    def __init__(self, publisher: zenoh.Publisher, gid: bytes) -> None:
-        self._publisher = publisher
-        self._gid = gid
-        self._numbers = count(1)
-
-    @property
-    def has_readers(self) -> bool:
-        """True if a subscriber matches."""
-        return bool(self._publisher.matching_status)
-
-    def publish(self, data: bytes) -> None:
-        """Send a message."""
-        self._publisher.put(data, attachment=pack_attachment(next(self._numbers), self._gid))
 
 
 class ZenohTransport:
@@ -101,19 +85,26 @@ class ZenohTransport:
             place += [topic.replace("/", "%"), *(ros_type.dds_name, ros_type.hash), QOS]
         token = "/".join(["@ros2_lv", *map(str, place)])
         self._declared.append(self._session.liveliness().declare_token(token))
-        return xxh3_128_intdigest(token).to_bytes(16, "little")
+        return xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
     def _format_key(self, topic: str, *names: str) -> str:
         return "/".join([str(self._domain), topic.strip("/"), *names])
 
-    def advertise(self, topic: str, kind: RosType) -> ZenohPublisher:
+    def advertise(self, topic: str, kind: RosType) -> Publisher:
         """Publish on a topic."""
         publisher = self._session.declare_publisher(
             self._format_key(topic, kind.dds_name, kind.hash),
             congestion_control=zenoh.CongestionControl.DROP,
         )
         self._declared.append(publisher)
-        return ZenohPublisher(publisher, self._declare_token("MP", topic, kind))
+        gid = self._declare_token("MP", topic, kind)
+        numbers = count(1)
+        return Publisher(
+            lambda: publisher.matching_status,
+            lambda message: publisher.put(
+                bytes(message.data), attachment=pack_attachment(next(numbers), gid)
+            ),
+        )
 
     def subscribe(self, topic: str, kind: RosType, take: Callable[[bytes], None]) -> None:
         """Pass the newest message of a topic to `take`. Messages of other types are reported."""
