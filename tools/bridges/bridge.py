@@ -1,7 +1,7 @@
 """A bridge reads the rings of a running rack, as the recorder does, so no board waits for it.
 
-The bridges in `BRIDGES` are known by name. Any other subclass of `Bridge` is given as
-"package.module:Class", for example to `rack bridge`. It is imported only when it is used.
+The bridges in `BRIDGES` are known by name. Any other subclass of `Bridge` is named to `rack bridge`
+as "package.module:Class". A bridge is imported only when it is used.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from typing import ClassVar
 
 import numpy as np
 
@@ -35,16 +34,15 @@ Tell = Callable[[str], None]
 class Bridge(ABC):
     """A connection of one rack to another tool.
 
-    The constructor opens the connection. It raises `Failure` if that is not possible.
+    The constructor opens it, or raises `Failure`. The first line that it shows reports success.
 
     Args:
         segment: The rack.
-        tell: Shows the user a line. The first one reports that the connection is open.
+        tell: Shows the user a line.
     """
 
     rings: Sequence[str] = ()
     """Tasks and mailboxes whose rows the bridge shows."""
-    period_s: ClassVar[float] = PERIOD_S
 
     @abstractmethod
     def __init__(self, segment: Segment, tell: Tell) -> None: ...
@@ -53,6 +51,7 @@ class Bridge(ABC):
     def show_rows(self, ring: str, rows: np.ndarray) -> None:
         """Show new rows of a ring, at least one, oldest first."""
 
+    @abstractmethod
     def advance(self, tick: int) -> None:
         """Continue after all rows written before `tick` have been shown."""
 
@@ -74,21 +73,20 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
     """
     try:
         bridge = find_class(BRIDGES.get(name, name), Bridge)(segment, tell)
-    except (ImportError, LookupError) as error:
-        cause = error.__cause__ or error
-        if name in BRIDGES and isinstance(cause, ImportError):
-            raise Failure(f"{cause.name} is missing: pip install 'nasrem-rack[{name}]'") from None
+    except LookupError as error:
+        if name in BRIDGES and isinstance(error.__cause__, ImportError):
+            why = f"{error.__cause__.name} is missing: pip install 'nasrem-rack[{name}]'"
+            raise Failure(why) from None
         known = ", ".join(BRIDGES)
         raise Failure(f"{error}; known bridges: {known}, or package.module:Class", 2) from None
-    rings = {ring: reader for ring, reader in open_rings(segment).items() if ring in bridge.rings}
     with closing(bridge):
-        for reader in rings.values():
+        rings = {ring: rows for ring, rows in open_rings(segment).items() if ring in bridge.rings}
+        for ring in rings.values():
             # Begin with the present, not with the two seconds that the rings still hold.
-            reader.read_new_rows()
-        for _ in poll_run(segment, bridge.period_s):
+            ring.read_new_rows()
+        for _ in poll_run(segment, PERIOD_S):
             tick = segment.words[System.TICK]
-            for ring, reader in rings.items():
-                rows = reader.read_new_rows().rows
-                if len(rows):
-                    bridge.show_rows(ring, rows)
+            for name, ring in rings.items():
+                if len(rows := ring.read_new_rows().rows):
+                    bridge.show_rows(name, rows)
             bridge.advance(tick)

@@ -119,16 +119,18 @@ def run(
         raise Failure("--view and --no-record: the viewer shows what is recorded; leave one out", 2)
     if (config is None) == (origin is None):
         raise Failure("give either CONFIG or --from RUN@TIME; see --help", 2)
-    overrides = list(settings)
-    overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
-    overrides += [f"clock.speed={speed}"] if speed is not None else []
-    if origin is not None and entries is not None:
-        raise Failure("--entries and --from: --from replays the entries anyway; leave one out", 2)
     if origin is not None:
+        if entries is not None:
+            raise Failure(
+                "--entries and --from: --from replays the entries anyway; leave one out", 2
+            )
+        lockstep = True
         from rack.tools.launch.continued import find_run_config, open_beginning
 
         config = str(find_run_config(origin))
     assert config is not None
+    overrides = [*settings, *["clock.mode=lockstep"] * lockstep]
+    overrides += [f"clock.speed={speed}"] if speed is not None else []
     tables_read = assemble(config, overrides, faults)
     crate = _preload_levels(context.obj, tables_read.tables)
     from rack.boards.config.loader import validate

@@ -30,14 +30,8 @@ HOST = "127.0.0.1"
 PORT_VARIABLE = "FOXGLOVE_PORT"
 PORT = 8765
 """Port to which Foxglove connects by default."""
-LOG_LEVELS = {
-    "died": LogLevel.Error,
-    "detection": LogLevel.Error,
-    "fault": LogLevel.Warning,
-    "reaction": LogLevel.Warning,
-    "stop": LogLevel.Warning,
-}
-"""Log level by kind of event. Other kinds have level Info."""
+TROUBLES = ("died", "detection", "fault", "reaction")
+"""Kinds of events that are warnings in the log."""
 
 
 class FoxgloveBridge(TopicBridge):
@@ -59,20 +53,18 @@ class FoxgloveBridge(TopicBridge):
         }
         folder = find_run_folder(segment)
         self._events = EventFile((folder or Path()) / "events.jsonl")
-        port = os.environ.get(PORT_VARIABLE) or str(PORT)
-        if not port.isdecimal() or int(port) > 65535:
-            raise Failure(f"{PORT_VARIABLE} = {port}: must be a port, 0 to 65535", 2)
+        port = os.environ.get(PORT_VARIABLE) or PORT
+        listener: Any = self
         try:
             self._server = foxglove.start_server(
                 name=segment.rack,
                 host=HOST,
                 port=int(port),
-                server_listener=self,
+                server_listener=listener,
                 context=self._context,
             )
-        except (OSError, RuntimeError) as error:
-            hint = f"{PORT_VARIABLE} chooses another one"
-            raise Failure(f"port {port} of {HOST}: {error}; {hint}") from None
+        except (OSError, RuntimeError, OverflowError, ValueError) as error:
+            raise Failure(f"{PORT_VARIABLE} = {port}: {error}") from None
         tell(f"open ws://{HOST}:{self._server.port} in Foxglove")
 
     def advertise(self, topic: str, kind: str) -> Publisher:
@@ -97,10 +89,9 @@ class FoxgloveBridge(TopicBridge):
         channel = self._timing.get(ring)
         if channel is not None and channel.has_sinks():
             missed, skipped = count_misses_and_skips(rows)
-            longest_ms = compute_response_ns(rows).max() * 1e-6
-            time_ns = self.encoder.compute_time(int(rows["tick"][-1]))
-            values = {"longest_response_ms": longest_ms, "missed": missed, "skipped": skipped}
-            channel.log(values, log_time=time_ns)
+            response_ms = compute_response_ns(rows).max() * 1e-6
+            values = {"response_ms": response_ms, "missed": missed, "skipped": skipped}
+            channel.log(values, log_time=self.encoder.compute_time(int(rows["tick"][-1])))
 
     def advance(self, tick: int) -> None:
         """Send diagnostics and events, and the whole cell to new readers."""
@@ -109,11 +100,12 @@ class FoxgloveBridge(TopicBridge):
         if self._new_readers and self._scene is not None:
             self._new_readers = False
             self._cell.log(self._scene, log_time=time_ns)
-        for event in self._events.read_new_events():
+        # The first reader gets the events since the start of the run.
+        for event in self._events.read_new_events() if self._log.has_sinks() else ():
             when_ns = self.encoder.compute_time(max(0, event.tick))
             entry = Log(
                 timestamp=Timestamp(*divmod(when_ns, 10**9)),
-                level=LOG_LEVELS.get(event.kind, LogLevel.Info),
+                level=LogLevel.Warning if event.kind in TROUBLES else LogLevel.Info,
                 message=f"{event.kind}: {event.text}",
                 name=event.board,
             )

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from foxglove import messages as fox
 
+from rack.levels.algebra import Array
 from rack.tools.ecosystem.ros_messages import WORLD
 
 Geom = mujoco.mjtGeom
@@ -38,35 +39,29 @@ def build_scene(model: mujoco.MjModel) -> fox.SceneUpdate:
     """Return the visible geoms of a model. Height fields are left out."""
     entities = []
     for geom in np.flatnonzero(model.geom_group < SHOWN_GROUPS).tolist():
-        x, y, z = model.geom_pos[geom].tolist()
-        qw, qx, qy, qz = model.geom_quat[geom].tolist()
         material = model.geom_matid[geom]
         rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-        look = {
-            "pose": fox.Pose(
-                position=fox.Vector3(x=x, y=y, z=z),
-                orientation=fox.Quaternion(x=qx, y=qy, z=qz, w=qw),
-            ),
-            "color": fox.Color(**dict(zip("rgba", rgba.tolist(), strict=True))),
+        position = _build(fox.Vector3, "xyz", model.geom_pos[geom])
+        orientation = _build(fox.Quaternion, "wxyz", model.geom_quat[geom])
+        look: dict[str, Any] = {
+            "pose": fox.Pose(position=position, orientation=orientation),
+            "color": _build(fox.Color, "rgba", rgba),
         }
         kind = Geom(int(model.geom_type[geom]))
         if kind == Geom.mjGEOM_MESH:
             field, primitive = "triangles", _build_mesh(model, model.geom_dataid[geom], look)
         elif kind in SHAPES:
-            field, build = SHAPES[kind]
+            field, build_shape = SHAPES[kind]
             size = 2.0 * np.minimum(model.geom_aabb[geom, 3:], MAX_HALF_M)
-            primitive = build(
-                size=fox.Vector3(**dict(zip("xyz", size.tolist(), strict=True))), **look
-            )
+            primitive = build_shape(size=_build(fox.Vector3, "xyz", size), **look)
         else:
             continue
         body = int(model.geom_bodyid[geom])
         # The names of the frames in /tf.
         frame = model.body(body).name or f"body_{body}" if body else WORLD
+        shown: dict[str, Any] = {field: [primitive]}
         entities.append(
-            fox.SceneEntity(
-                id=f"geom {geom}", frame_id=frame, frame_locked=True, **{field: [primitive]}
-            )
+            fox.SceneEntity(id=f"geom {geom}", frame_id=frame, frame_locked=True, **shown)
         )
     return fox.SceneUpdate(entities=entities)
 
@@ -76,5 +71,10 @@ def _build_mesh(model: mujoco.MjModel, number: int, look: dict[str, Any]) -> Any
     mesh = model.mesh(number)
     vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
     faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
-    points = [fox.Point3(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
+    points = [_build(fox.Point3, "xyz", vertex) for vertex in vertices]
     return fox.TriangleListPrimitive(points=points, indices=faces.ravel().tolist(), **look)
+
+
+def _build(kind: Any, keys: str, values: Array) -> Any:
+    """Build a message of Foxglove from the values of its fields, which have one-letter names."""
+    return kind(**dict(zip(keys, values.tolist(), strict=True)))

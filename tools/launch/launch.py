@@ -169,7 +169,6 @@ def run_rack(
             recorder = None if folder is None else RecorderProcess(folder)
             if recorder is not None:
                 stack.callback(recorder.finish)
-            joined = [import_module(BRIDGES).BridgeProcess(name, stack) for name in bridges]
             rack = stack.enter_context(
                 Rack(
                     config,
@@ -193,7 +192,10 @@ def run_rack(
                     log.add_event(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
                 if port is not None:
                     news.append(("recorder", import_module(VIEWER).open_window(port)))
-            news += [("printed", bridge.attach(config.name)) for bridge in joined]
+            news += [
+                ("printed", import_module(BRIDGES).start_bridge(name, config.name, stack))
+                for name in bridges
+            ]
 
         def log_news() -> None:
             """Log new messages of the recorder, the viewer and the bridges."""

@@ -7,7 +7,6 @@ for motion requests takes `/joint_trajectory`.
 
 from __future__ import annotations
 
-import os
 import time
 
 from rosbags.typesys import get_types_from_msg
@@ -15,13 +14,11 @@ from rosbags.typesys import get_types_from_msg
 from rack.backplane.errors import MailboxError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
-from rack.levels.references import import_reference
 from rack.tools.bridges.bridge import Tell
-from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE, build, convert_name
+from rack.tools.ros2.node import ROUTER, RosNode, RosType
 from rack.tools.ros2.topics import Publisher, TopicBridge
 from rack.tools.ros2.trajectory import TYPE, TrajectoryFollower, find_motion_board
-from rack.tools.ros2.transport import RosType, Transport, find_type
 
 STOP_SERVICE = "/rack/emergency_stop"
 TRIGGER = RosType(
@@ -31,33 +28,29 @@ TRIGGER = RosType(
 RESPONSE = f"{TRIGGER.name}_Response"
 STORE.register(get_types_from_msg("bool success\nstring message", RESPONSE))
 TRAJECTORY_TOPIC = "/joint_trajectory"
-TRANSPORTS = {
-    "rmw_zenoh_cpp": "rack.tools.ros2.zenoh_transport:ZenohTransport",
-    "rmw_cyclonedds_cpp": "rack.tools.ros2.dds_transport:DdsTransport",
-}
-"""Class for each middleware, by its name in ROS."""
 QUIET_S = 1.0
 """Shortest time between two lines about the same topic."""
 
 
 class Ros2Bridge(TopicBridge):
-    """Connects a rack to ROS 2, over zenoh or DDS as the environment asks."""
+    """A rack as a node of ROS 2."""
 
     def __init__(self, segment: Segment, tell: Tell) -> None:
         self._told: dict[str, float] = {}
         self._show = tell
         self._lines = UtilityLines(segment)
         self._follower: TrajectoryFollower | None = None
-        self._transport = open_transport(convert_name(f"rack_{segment.rack}"), self._tell_rarely)
+        self._node = RosNode(convert_name(f"rack_{segment.rack}"), self._tell_rarely)
         super().__init__(segment)
-        self._transport.serve(STOP_SERVICE, TRIGGER, self._stop)
+        self._node.serve(STOP_SERVICE, TRIGGER, self._stop)
         trajectories = self._take_trajectories(segment)
-        topics = len(self.publishers)
-        tell(f"{self._transport.description}: {topics} topics, {STOP_SERVICE}, {trajectories}")
+        text = f"rmw_zenoh, domain {self._node.domain}: {len(self.publishers)} topics"
+        router = "" if self._node.has_router else f"; waiting for the router of ROS at {ROUTER}"
+        tell(f"{text}, {STOP_SERVICE}, {trajectories}{router}")
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""
-        return self._transport.advertise(topic, find_type(kind))
+        return self._node.advertise(topic, RosType(kind, STORE.hash_rihs01(kind)))
 
     def _stop(self) -> bytes:
         """Set the emergency stop, and return the encoded response."""
@@ -73,7 +66,8 @@ class Ros2Bridge(TopicBridge):
             try:
                 self._follower = TrajectoryFollower(segment, wiring, self._tell_rarely)
                 take = self._follower.take_message
-                self._transport.subscribe(TRAJECTORY_TOPIC, find_type(TYPE), take)
+                kind = RosType(TYPE, STORE.hash_rihs01(TYPE))
+                self._node.subscribe(TRAJECTORY_TOPIC, kind, take)
                 return TRAJECTORY_TOPIC
             except MailboxError as error:
                 why = str(error)
@@ -90,32 +84,10 @@ class Ros2Bridge(TopicBridge):
     def advance(self, tick: int) -> None:
         """Send diagnostics, and process what has been received."""
         super().advance(tick)
-        self._transport.poll()
+        self._node.poll()
 
     def close(self) -> None:
         """Leave the network."""
         if self._follower is not None:
             self._follower.close()
-        self._transport.close()
-
-
-def open_transport(name: str, tell: Tell) -> Transport:
-    """Open a node on the middleware that `RMW_IMPLEMENTATION` names. The default is zenoh.
-
-    Args:
-        name: Name of the node.
-        tell: Shows the user a line.
-
-    Raises:
-        Failure: A variable is invalid, or the network cannot be reached.
-    """
-    wanted = os.environ.get("RMW_IMPLEMENTATION") or "rmw_zenoh_cpp"
-    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-    if wanted not in TRANSPORTS:
-        valid = ", ".join(TRANSPORTS)
-        raise Failure(f"RMW_IMPLEMENTATION = {wanted}: must be one of {valid}", 2)
-    if not domain.isdecimal() or int(domain) > 232:
-        raise Failure(f"ROS_DOMAIN_ID = {domain}: must be a number from 0 to 232", 2)
-    module, kind = import_reference(TRANSPORTS[wanted])
-    transport: Transport = getattr(module, kind)(name, int(domain), tell)
-    return transport
+        self._node.close()

@@ -16,9 +16,6 @@ from rack.boards.config.loader import read_stored
 from rack.tools.bridges.bridge import Bridge
 from rack.tools.ecosystem.ros_messages import DIAGNOSTICS_S, RosEncoder, RosMessage, RosSource
 
-STATUS_PASSES = 5
-"""Number of passes after which a board's status is sent again."""
-
 
 class Publisher(NamedTuple):
     """Sends the messages of a topic.
@@ -55,7 +52,6 @@ class TopicBridge(Bridge):
         self.rings = tuple(self._sources)
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
         self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
-        self._passes = 0
 
     @abstractmethod
     def advertise(self, topic: str, kind: str) -> Publisher:
@@ -70,7 +66,6 @@ class TopicBridge(Bridge):
 
     def advance(self, tick: int) -> None:
         """Send the diagnostics of completed seconds."""
-        self._passes += 1
         complete = tick // self._second * self._second
         for ring, blocks in self._cycles.items():
             if blocks and blocks[0]["tick"][0] < complete:
@@ -82,8 +77,7 @@ class TopicBridge(Bridge):
     def _send(self, ring: str, rows: np.ndarray) -> None:
         """Encode and send the messages of a ring's topics."""
         for source in self._sources[ring]:
-            topic = source.topic.name
-            is_due = not topic.endswith("/status") or self._passes % STATUS_PASSES == 0
-            if is_due and self.publishers[topic].has_readers():
+            publisher = self.publishers[source.topic.name]
+            if publisher.has_readers():
                 for message in self.encoder.encode(source, rows):
-                    self.publishers[topic].publish(message)
+                    publisher.publish(message)

@@ -14,8 +14,6 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rack.backplane.segment import Segment
 from rack.boards.config.loader import load_text, read_stored
 from rack.boards.config.resolved import resolve
@@ -24,13 +22,14 @@ from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 from rack.levels.references import find_class
-from rack.levels.systems.trajectory.commands import Motions
-from rack.levels.systems.trajectory.messages import MotionRequest, RequestEnd
+from rack.levels.systems.trajectory.commands import CommandEnvironment
+from rack.levels.systems.trajectory.messages import RequestEnd
 from rack.tools.bridges.bridge import Tell
 from rack.tools.ecosystem.ros_messages import STORE
 
 TYPE = "trajectory_msgs/msg/JointTrajectory"
-MAX_POINTS = 10_000
+MAX_BYTES = 1 << 20
+"""Longest message that is taken from the network."""
 AHEAD = 8
 """Number of requests that wait in the rack. A new trajectory never waits for their queue."""
 MAX_HALF_BLEND_S = 0.3
@@ -56,6 +55,8 @@ def read_trajectory(data: bytes, joints: Sequence[str]) -> list[Point]:
     Raises:
         ValueError: The message has a mistake.
     """
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"{len(data)} bytes; valid: up to {MAX_BYTES}")
     try:
         message: Any = STORE.deserialize_cdr(data, TYPE)
     except Exception as error:
@@ -64,16 +65,14 @@ def read_trajectory(data: bytes, joints: Sequence[str]) -> list[Point]:
     if sorted(names) != sorted(joints):
         given = format_value(", ".join(names))
         raise ValueError(f"joint_names = {given}: must be {', '.join(joints)}, in any order")
-    if len(message.points) > MAX_POINTS:
-        raise ValueError(f"{len(message.points)} points; valid: up to {MAX_POINTS}")
     order = [names.index(joint) for joint in joints]
     points: list[Point] = []
-    before_s = -1.0
+    before_s = -1e-9
     for at, point in enumerate(message.points):
         time_s = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
-        if len(point.positions) != len(joints) or not np.isfinite(point.positions).all():
-            raise ValueError(f"points[{at}].positions: must be {len(joints)} finite numbers")
-        if time_s < 0.0 or time_s <= before_s:
+        if len(point.positions) != len(joints):
+            raise ValueError(f"points[{at}].positions: must be {len(joints)} numbers")
+        if not before_s < time_s:
             raise ValueError(f"points[{at}].time_from_start = {time_s:g} s: must rise from 0 on")
         points.append(Point(time_s, point.positions[order].tolist()))
         before_s = time_s
@@ -91,9 +90,7 @@ def find_motion_board(segment: Segment) -> HostWiring | None:
         return None
     for wiring in resolve(load_text(segment.config)).hosts:
         program = find_class(wiring.target, HostProgram)
-        requests = program.outputs.get("requests")
-        is_wanted = requests is not None and requests.message is MotionRequest
-        if wiring.is_external and is_wanted and "motion" in program.inputs:
+        if wiring.is_external and issubclass(program, CommandEnvironment):
             return wiring
     return None
 
@@ -111,12 +108,10 @@ class TrajectoryFollower:
     """
 
     def __init__(self, segment: Segment, wiring: HostWiring, tell: Tell) -> None:
-        program = find_class(wiring.target, HostProgram)(wiring.context)
+        self._program = find_class(wiring.target, CommandEnvironment)(wiring.context)
         self._bus = HostBus(segment, wiring)
-        self._bus.connect_ports(program)
-        ports = vars(program)
-        self._status = ports["motion"]
-        self._motions = Motions(self._bus, self._status, ports["requests"], wiring.context)
+        self._bus.connect_ports(self._program)
+        self._motions = self._program.motions(self._bus)
         self._joints = wiring.context.robot.joints
         self._tell = tell
         self._trajectories: SimpleQueue[list[Point]] = SimpleQueue()
@@ -159,7 +154,8 @@ class TrajectoryFollower:
         if motions.wait(requests[-1], self._has_newer):
             outcome = motions.end_of(requests[-1])
             if outcome not in (RequestEnd.DONE, RequestEnd.NONE):
-                reason = self._status.read().message.reason
+                status: Any = self._program.motion
+                reason = status.read().message.reason
                 self._tell(f"/joint_trajectory: {outcome.name.lower()}: {reason}")
 
     def close(self) -> None:
