@@ -79,14 +79,22 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
             raise Failure(why) from None
         known = ", ".join(BRIDGES)
         raise Failure(f"{error}; known bridges: {known}, or package.module:Class", 2) from None
-    with closing(bridge):
-        rings = {ring: rows for ring, rows in open_rings(segment).items() if ring in bridge.rings}
-        for ring in rings.values():
-            # Begin with the present, not with the two seconds that the rings still hold.
-            ring.read_new_rows()
-        for _ in poll_run(segment, PERIOD_S):
-            tick = segment.words[System.TICK]
-            for name, ring in rings.items():
-                if len(rows := ring.read_new_rows().rows):
-                    bridge.show_rows(name, rows)
-            bridge.advance(tick)
+    try:
+        with closing(bridge):
+            _show_run(bridge, segment)
+    except Exception as error:
+        raise Failure(f"{type(error).__name__}: {error}") from error
+
+
+def _show_run(bridge: Bridge, segment: Segment) -> None:
+    """Pass the rows of the rings to a bridge until the run is over."""
+    rings = {ring: rows for ring, rows in open_rings(segment).items() if ring in bridge.rings}
+    for ring in rings.values():
+        # Begin with the present, not with the two seconds that the rings still hold.
+        ring.read_new_rows()
+    for _ in poll_run(segment, PERIOD_S):
+        tick = segment.words[System.TICK]
+        for name, ring in rings.items():
+            if len(rows := ring.read_new_rows().rows):
+                bridge.show_rows(name, rows)
+        bridge.advance(tick)

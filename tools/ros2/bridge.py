@@ -16,7 +16,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.tools.bridges.bridge import Tell
 from rack.tools.ecosystem.ros_messages import STORE, build, convert_name
-from rack.tools.ros2.node import ROUTER, RosNode, RosType
+from rack.tools.ros2.node import RosNode, RosType
 from rack.tools.ros2.topics import Publisher, TopicBridge
 from rack.tools.ros2.trajectory import TYPE, TrajectoryFollower, find_motion_board
 
@@ -25,7 +25,7 @@ TRIGGER = RosType(
     "std_srvs/srv/Trigger",
     "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
 )
-RESPONSE = f"{TRIGGER.name}_Response"
+RESPONSE = "std_srvs/msg/Trigger_Response"
 STORE.register(get_types_from_msg("bool success\nstring message", RESPONSE))
 TRAJECTORY_TOPIC = "/joint_trajectory"
 QUIET_S = 1.0
@@ -45,8 +45,7 @@ class Ros2Bridge(TopicBridge):
         self._node.serve(STOP_SERVICE, TRIGGER, self._stop)
         trajectories = self._take_trajectories(segment)
         text = f"rmw_zenoh, domain {self._node.domain}: {len(self.publishers)} topics"
-        router = "" if self._node.has_router else f"; waiting for the router of ROS at {ROUTER}"
-        tell(f"{text}, {STOP_SERVICE}, {trajectories}{router}")
+        tell(f"{text}, {STOP_SERVICE}, {trajectories}{self._node.describe_router()}")
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""

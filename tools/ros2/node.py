@@ -159,10 +159,11 @@ class RosNode:
         """Close the session. Other nodes notice it at once."""
         self._session.close()  # type: ignore[no-untyped-call]
 
-    @property
-    def has_router(self) -> bool:
-        """True if the node is connected to a router, without which no other node finds it."""
-        return bool(self._session.info.routers_zid())
+    def describe_router(self) -> str:
+        """Return a note if the router is missing, without which no other node finds this one."""
+        if self._session.info.routers_zid() or CONFIG_VARIABLE in os.environ:
+            return ""
+        return f"; waiting for the router of ROS at {ROUTER}"
 
 
 def _take_waiting(channel: Any) -> Iterator[Any]:

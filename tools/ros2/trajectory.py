@@ -157,6 +157,8 @@ class TrajectoryFollower:
                 status: Any = self._program.motion
                 reason = status.read().message.reason
                 self._tell(f"/joint_trajectory: {outcome.name.lower()}: {reason}")
+                # Otherwise the level would refuse other requests, too.
+                motions.cancel()
 
     def close(self) -> None:
         """Give the host board back. The rack completes the requests that it has."""
