@@ -53,11 +53,11 @@ def main() -> None:
         config.insert_json5(key, json.dumps(value))
     session = zenoh.open(config)
     tokens = session.liveliness().declare_subscriber(
-        "@ros2_lv/42/**", zenoh.handlers.FifoChannel(1000), history=True
+        "@ros2_lv/42/**", zenoh.handlers.RingChannel(1000), history=True
     )
-    topics = session.declare_subscriber("42/**", zenoh.handlers.FifoChannel(10_000))
+    topics = session.declare_subscriber("42/**", zenoh.handlers.RingChannel(10_000))
     trajectory = session.declare_publisher(key_of("/joint_trajectory", JointTrajectory))
-    print(json.dumps({"open": True}), flush=True)
+    write({"open": True})
     for line in sys.stdin:
         request = json.loads(line)
         answer: Any = None
@@ -65,7 +65,8 @@ def main() -> None:
             case "tokens":
                 answer = [[str(t.key_expr), t.kind == zenoh.SampleKind.PUT] for t in drain(tokens)]
             case "samples":
-                answer = [describe(sample) for sample in drain(topics)]
+                found = drain(topics)
+                answer = [describe(s) for s in found if "/joint_trajectory/" not in str(s.key_expr)]
             case "stop":
                 replies = session.get(
                     key_of("/rack/emergency_stop", Trigger),
@@ -97,8 +98,14 @@ def main() -> None:
                 key = request.get("key") or key_of("/joint_trajectory", JointTrajectory)
                 for _ in range(request.get("times", 1)):
                     session.put(key, bytes.fromhex(request["hex"]), attachment=ATTACHMENT)
-        print(json.dumps(answer), flush=True)
+        write(answer)
     os._exit(0)
+
+
+def write(answer: Any) -> None:
+    """Write an answer."""
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
 
 
 def drain(channel: Any) -> list[Any]:

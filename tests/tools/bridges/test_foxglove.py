@@ -141,7 +141,7 @@ def test_mistakes_are_one_line_each(
     (tmp_path / "own_bridges.py").write_text("class NoBridge: ...\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     cases = {
-        (("nowhere", "ros2"), ""): (2, "no rack"),
+        (("nowhere", "ros2"), ""): (1, "rack 'nowhere' does not exist"),
         ((shown.name, "ros1"), ""): (2, "known bridges: ros2, foxglove, or package.module:Class"),
         ((shown.name, "own_bridges:NoBridge"), ""): (2, "has no Bridge named 'NoBridge'"),
         ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (1, "FOXGLOVE_PORT = many: "),
