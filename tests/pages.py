@@ -18,6 +18,7 @@ GUIDES = (
     "configs/ANNOTATED.md",
     "configs/TUTORIAL.md",
     "levels/DRIVES.md",
+    "tools/NEIGHBOURS.md",
     "tools/PYTHON.md",
     "tools/REWIND.md",
     "tools/SIGNALS.md",

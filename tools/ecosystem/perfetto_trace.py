@@ -122,7 +122,8 @@ def export_trace(recording: Recording, path: Path, show_progress: Callable[[floa
         }
         arrows = _write_messages(recording, writer, tracks)
         for number, (task, track) in enumerate(tracks.items()):
-            _write_cycles(writer, track, cycles[task], arrows[task])
+            sim_ns = cycles[task]["tick"] * recording.layout.clock_ns
+            _write_cycles(writer, track, cycles[task], sim_ns, arrows[task])
             show_progress((number + 1) / len(tracks))
         _write_cores(recording, writer)
         _write_events(recording, writer, tracks)
@@ -188,9 +189,21 @@ def _find_readings(
 
 
 def _write_cycles(
-    writer: PerfettoWriter, track: int, rows: np.ndarray, arrows: Mapping[int, Sequence[int]]
+    writer: PerfettoWriter,
+    track: int,
+    rows: np.ndarray,
+    sim_ns: np.ndarray,
+    arrows: Mapping[int, Sequence[int]],
 ) -> None:
-    """Write the cycles of a task, with the numbers of the arrows that end at each."""
+    """Write the cycles of a task.
+
+    Args:
+        writer: Writer of the trace.
+        track: Number of the task's track.
+        rows: Trace records of the task.
+        sim_ns: Simulated time of their releases.
+        arrows: Numbers of the arrows that end at a cycle, by index of the cycle.
+    """
     late = compute_lateness_ns(rows)
     missed = find_missed_cycles(rows)
     skipped = count_skipped_releases(rows)
@@ -198,7 +211,11 @@ def _write_cycles(
         start, read, process, end = (
             int(row[name]) for name in ("start_ns", "read_ns", "process_ns", "end_ns")
         )
-        values = {"tick": int(row["tick"]), "late_ns": int(late[cycle])}
+        values = {
+            "tick": int(row["tick"]),
+            "sim_ns": int(sim_ns[cycle]),
+            "late_ns": int(late[cycle]),
+        }
         if skipped[cycle]:
             writer.add(track, start, INSTANT, "skipped", {"releases": int(skipped[cycle])})
         writer.add(track, start, BEGIN, "cycle", values)

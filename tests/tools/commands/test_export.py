@@ -1,4 +1,4 @@
-"""Tests `rack export`: the MCAP file contains the recording, with units and meanings."""
+"""Tests the files that `rack export` writes, and what it refuses. Their contents: ecosystem."""
 
 from __future__ import annotations
 
@@ -8,12 +8,17 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
-from rack.tools.recording.recording import Recording
+from rack.boards.config import load
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
+from tests.tools.recordings import recorded
 
 pytestmark = pytest.mark.slow
+
+FILES = {"mcap": "run.mcap", "rosbag2": "run-rosbag2", "perfetto": "run.pftrace"}
+"""Default name of each kind."""
 
 
 @pytest.fixture(scope="module")
@@ -21,78 +26,90 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_run(tmp_path_factory)
 
 
-@pytest.fixture(scope="module")
-def exported(run: Path) -> Path:
-    done = rack("export", run, "--json")
+def export(run: Path, kind: str) -> int:
+    """Export a run under the default name, and return the number of entries."""
+    done = rack("export", run, "--to", kind, "--json")
     assert (done.returncode, done.stderr) == (0, "")
-    assert json.loads(done.stdout)["file"] == str(run / "run.mcap")
+    answer = json.loads(done.stdout)
+    path = run / FILES[kind]
+    files = [path] if path.is_file() else [*path.iterdir()]
+    assert answer["file"] == str(path)
+    assert answer["bytes"] == sum(file.stat().st_size for file in files)
     assert [*run.glob("*.part")] == []
-    return run / "run.mcap"
+    return int(answer["slices" if kind == "perfetto" else "messages"])
 
 
-def test_every_message_is_exported_as_it_was_written(run: Path, exported: Path) -> None:
-    recording = Recording(run)
-    clock_ns = recording.layout.clock_ns
-    ticks: dict[str, list[int]] = {}
-    states: dict[str, list[object]] = {}
-    times, events = [], []
-    with exported.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages():
-            value = json.loads(message.data)
-            ticks.setdefault(channel.topic, []).append(value["tick"])
-            states.setdefault(channel.topic, []).append(value.get("state"))
-            assert message.log_time == value["tick"] * clock_ns
-            times.append(message.log_time)
-            events += [value] if channel.topic == "events" else []
-    assert times == sorted(times)
-    del ticks["events"]
-    wanted = [event for event in recording.events if event.get("tick", -1) >= 0]
-    assert sorted(events, key=str) == sorted(wanted, key=str)
-    assert {*ticks} == {*recording.mailboxes}
-    for name, found in ticks.items():
-        assert found == recording.read_signal(name, "tick").tolist()
-    assert {*states["lower.status"]} <= {"idle", "executing", "done", "error", "holding"}
+def test_files_are_written_whole_and_counted(run: Path) -> None:
+    count = export(run, "mcap")
+    assert export(run, "rosbag2") == count
+    bag = run / FILES["rosbag2"]
+    assert {file.name for file in bag.iterdir()} == {"metadata.yaml", "run-rosbag2.mcap"}
+    for path in (run / FILES["mcap"], bag / "run-rosbag2.mcap"):
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == count
+    slices = export(run, "perfetto")
+    packets = Trace.FromString((run / FILES["perfetto"]).read_bytes()).packet
+    events = [packet.track_event for packet in packets if packet.HasField("track_event")]
+    assert slices == sum(event.type != event.TYPE_SLICE_END for event in events)
 
 
-def test_schemas_have_units_and_meanings(run: Path, exported: Path) -> None:
-    with exported.open("rb") as file:
-        reader = make_reader(file)
-        summary = reader.get_summary()
-        (rack_text,) = [found.metadata for found in reader.iter_metadata()]
-    assert summary is not None
-    assert rack_text["config.toml"] == Recording(run).config
-    schemas = {
-        channel.topic: json.loads(summary.schemas[channel.schema_id].data)["properties"]
-        for channel in summary.channels.values()
-    }
-    for box in Recording(run).layout.mailboxes:
-        if box.name in schemas:
-            fields = schemas[box.name]
-            assert fields["tick"]["type"] == "integer"
-            for field in box.fields:
-                if not field.fields:
-                    assert field.meaning in fields[field.name]["description"]
-    assert schemas["lower.status"]["state"]["type"] == "string"
+@pytest.mark.parametrize("kind", FILES)
+def test_an_existing_file_is_kept(run: Path, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    path.write_text("kept")
+    done = rack("export", run, "--to", kind, "--out", path)
+    wanted = f"{path}: exists already; remove it, or give another --out\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", wanted)
+    assert path.read_text() == "kept"
 
 
-def test_a_refused_export_is_reported_in_one_line(
-    run: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    size = exported.stat().st_size
-    for words, status, why in (
-        ((run,), 2, f"{exported}: exists already; remove it, or give another --out"),
-        ((tmp_path,), 2, f"{tmp_path}: not a run: it has no config.toml"),
-        ((run, "--out", "/dev/full/x"), 2, '"/dev/full/x.part": Not a directory'),
+def test_a_refused_export_is_reported_in_one_line(run: Path, small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    empty = recorded(tmp_path / "empty", load(small, []), {}).folder
+    for words, why in (
+        ((out,), f"{out}: not a run: it has no config.toml"),
+        ((run, "--out", "/dev/full/x"), '"/dev/full/x.part": Not a directory'),
+        ((empty, "--out", out / "x"), f"{empty}: no message is recorded, so a bag would be empty"),
+        (
+            (empty, "--to", "perfetto", "--out", out / "x"),
+            f"{empty}: no cycle is recorded, so the trace would be empty",
+        ),
     ):
         done = rack("export", *words)
-        assert (done.returncode, done.stdout, done.stderr) == (status, "", f"{why}\n")
-    assert exported.stat().st_size == size
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    monkeypatch.delitem(sys.modules, "rack.tools.ecosystem.mcap_json")
-    monkeypatch.delattr("rack.tools.ecosystem.mcap_json")
-    done = rack("export", run, "--out", tmp_path / "x.mcap")
-    assert (done.returncode, done.stderr) == (
-        1,
-        "--to mcap needs mcap: pip install 'nasrem-rack[export]'\n",
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{why}\n")
+    assert [*out.iterdir()] == []
+
+
+def test_an_unknown_kind_is_refused_with_the_known_ones(run: Path) -> None:
+    done = rack("export", run, "--to", "bag")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines()[-1] == (
+        "Error: Invalid value for '--to': Value error, 'bag' is not one of 'mcap', 'rosbag2',"
+        " 'perfetto'."
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "package", "extra"),
+    [("mcap", "rosbags", "export"), ("rosbag2", "rosbags", "export"), ("perfetto",) * 3],
+)
+def test_a_missing_package_is_named_with_the_line_that_installs_it(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    package: str,
+    extra: str,
+) -> None:
+    for name in list(sys.modules):
+        if name.startswith(("rack.tools.ecosystem", f"{package}.")):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    done = rack("export", run, "--to", kind, "--out", tmp_path / "x")
+    wanted = f"--to {kind} needs {package}: pip install 'nasrem-rack[{extra}]'\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", wanted)
     assert [*tmp_path.iterdir()] == []
