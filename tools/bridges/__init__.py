@@ -1,1 +1,1 @@
-"""Bridges, which connect a running rack to other people's tools, each in a process of its own."""
+"""Bridges from a running rack to ROS 2 and Foxglove, each in a process of its own."""

@@ -20,8 +20,8 @@ from rack.tools.monitor.polling import poll_run
 from rack.tools.recording.spool import open_rings
 
 BRIDGES = {
-    "ros2": "rack.tools.ros2.bridge:Ros2Bridge",
-    "foxglove": "rack.tools.foxglove.bridge:FoxgloveBridge",
+    "ros2": "rack.tools.bridges.ros2:Ros2Bridge",
+    "foxglove": "rack.tools.bridges.foxglove:FoxgloveBridge",
 }
 """Class of each bridge. Its name is also that of the extra that installs its libraries."""
 PERIOD_S = 0.02

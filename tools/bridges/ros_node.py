@@ -20,9 +20,9 @@ from xxhash import xxh3_128_intdigest
 
 from rack.backplane.json_text import encode_json
 from rack.tools.bridges.bridge import Tell
+from rack.tools.bridges.topics import Publisher
 from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import RosMessage
-from rack.tools.ros2.topics import Publisher
 
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
 """Environment variable with the path of a configuration of zenoh, as for rmw_zenoh."""

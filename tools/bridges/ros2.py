@@ -15,10 +15,10 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.tools.bridges.bridge import Tell
+from rack.tools.bridges.ros_node import RosNode, RosType
+from rack.tools.bridges.topics import Publisher, TopicBridge
+from rack.tools.bridges.trajectory import TYPE, TrajectoryFollower, find_motion_board
 from rack.tools.ecosystem.ros_messages import STORE, build, convert_name
-from rack.tools.ros2.node import RosNode, RosType
-from rack.tools.ros2.topics import Publisher, TopicBridge
-from rack.tools.ros2.trajectory import TYPE, TrajectoryFollower, find_motion_board
 
 STOP_SERVICE = "/rack/emergency_stop"
 TRIGGER = RosType(

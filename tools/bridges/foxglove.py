@@ -20,11 +20,11 @@ from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.loader import read_stored
 from rack.boards.timing.trace_times import compute_response_ns, count_misses_and_skips
 from rack.tools.bridges.bridge import Tell
+from rack.tools.bridges.scene import build_scene
+from rack.tools.bridges.topics import Publisher, TopicBridge
 from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE
-from rack.tools.foxglove.scene import build_scene
 from rack.tools.recording.current_run import EventFile, find_run_folder
-from rack.tools.ros2.topics import Publisher, TopicBridge
 
 HOST = "127.0.0.1"
 PORT_VARIABLE = "FOXGLOVE_PORT"

@@ -1,1 +1,0 @@
-"""A running rack in Foxglove."""
