@@ -37,8 +37,9 @@ def start_bridge(name: str, rack: str, stack: ExitStack) -> Callable[[], list[st
         process_group=0,
         preexec_fn=partial(die_with_parent, os.getpid()),
     )
-    stack.callback(_end_process, process)
     assert process.stderr is not None, "it is a pipe"
+    stack.enter_context(process.stderr)
+    stack.callback(_end_process, process)
     output = process.stderr.fileno()
     wait_readable(output, ATTACH_S)
     unread = b""

@@ -104,7 +104,7 @@ def held_rack(
             wait_until(lambda: segment.words[System.HELD], BOUND_S)
             yield HeldRack(name, segment, process.pid, log)
             segment.close()
-            process.terminate()
+            rack("stop", name)
             process.wait(BOUND_S)
         finally:
             process.kill()
