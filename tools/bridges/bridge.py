@@ -1,7 +1,7 @@
 """A bridge reads the rings of a running rack, as the recorder does, so no board waits for it.
 
-The bridges in `BRIDGES` are known by name. Any other subclass of `Bridge` is named to `rack bridge`
-as "package.module:Class". A bridge is imported only when it is used.
+The bridges in `BRIDGES` are known by name. Any other subclass of `RackBridge` is named to `rack
+bridge` as "package.module:Class". A bridge is imported only when it is used.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Tell = Callable[[str], None]
 """Function that shows the user a line."""
 
 
-class Bridge(ABC):
+class RackBridge(ABC):
     """A connection of one rack to another tool.
 
     The constructor opens it, or raises `Failure`. The first line that it shows reports success.
@@ -72,7 +72,7 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
         Failure: There is no such bridge, a library is missing, or the connection failed.
     """
     try:
-        bridge = find_class(BRIDGES.get(name, name), Bridge)(segment, tell)
+        bridge = find_class(BRIDGES.get(name, name), RackBridge)(segment, tell)
     except LookupError as error:
         if name in BRIDGES and isinstance(error.__cause__, ImportError):
             why = f"{error.__cause__.name} is missing: pip install 'nasrem-rack[{name}]'"
@@ -86,7 +86,7 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
         raise Failure(f"{type(error).__name__}: {error}") from error
 
 
-def _show_run(bridge: Bridge, segment: Segment) -> None:
+def _show_run(bridge: RackBridge, segment: Segment) -> None:
     """Pass the rows of the rings to a bridge until the run is over."""
     rings = {ring: rows for ring, rows in open_rings(segment).items() if ring in bridge.rings}
     for ring in rings.values():

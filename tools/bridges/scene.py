@@ -53,6 +53,7 @@ def build_scene(model: mujoco.MjModel) -> fox.SceneUpdate:
         elif kind in SHAPES:
             field, build_shape = SHAPES[kind]
             size = 2.0 * np.minimum(model.geom_aabb[geom, 3:], MAX_HALF_M)
+            size[2] *= kind != Geom.mjGEOM_PLANE
             primitive = build_shape(size=_build(fox.Vector3, "xyz", size), **look)
         else:
             continue

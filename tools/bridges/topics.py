@@ -13,7 +13,7 @@ import numpy as np
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.loader import read_stored
-from rack.tools.bridges.bridge import Bridge
+from rack.tools.bridges.bridge import RackBridge
 from rack.tools.ecosystem.ros_messages import DIAGNOSTICS_S, RosEncoder, RosMessage, RosSource
 
 
@@ -29,7 +29,7 @@ class Publisher(NamedTuple):
     publish: Callable[[RosMessage], object]
 
 
-class TopicBridge(Bridge):
+class TopicBridge(RackBridge):
     """Sends the newest message of each topic in each pass, while somebody receives the topic.
 
     A subclass opens its connection, then calls `__init__`.

@@ -143,7 +143,7 @@ def test_mistakes_are_one_line_each(
     cases = {
         (("nowhere", "ros2"), ""): (1, "rack 'nowhere' does not exist"),
         ((shown.name, "ros1"), ""): (2, "known bridges: ros2, foxglove, or package.module:Class"),
-        ((shown.name, "own_bridges:NoBridge"), ""): (2, "has no Bridge named 'NoBridge'"),
+        ((shown.name, "own_bridges:NoBridge"), ""): (2, "has no RackBridge named 'NoBridge'"),
         ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (1, "FOXGLOVE_PORT = many: "),
         ((shown.name, "foxglove"), "FOXGLOVE_PORT=99999"): (1, "FOXGLOVE_PORT = 99999: "),
         ((shown.name, "ros2"), "ROS_DOMAIN_ID=300"): (2, "ROS_DOMAIN_ID = 300: must be from 0 to"),
