@@ -23,11 +23,7 @@ from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import (
 from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
 
 from rack.backplane.layout import MailboxSpec
-from rack.boards.timing.trace_times import (
-    compute_lateness_ns,
-    count_skipped_releases,
-    find_missed_cycles,
-)
+from rack.boards.timing.trace_times import count_skipped_releases, find_missed_cycles
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
@@ -87,7 +83,8 @@ class PerfettoWriter:
         ]
         event = {"type": kind, "track_uuid": track, "name": name, "debug_annotations": notes}
         packet = TracePacket(
-            timestamp=time_ns - self._origin_ns,
+            # A run that continues another one takes over its events, which are older.
+            timestamp=max(0, time_ns - self._origin_ns),
             trusted_packet_sequence_id=1,
             track_event=event | flows,
         )
@@ -122,8 +119,7 @@ def export_trace(recording: Recording, path: Path, show_progress: Callable[[floa
         }
         arrows = _write_messages(recording, writer, tracks)
         for number, (task, track) in enumerate(tracks.items()):
-            sim_ns = cycles[task]["tick"] * recording.layout.clock_ns
-            _write_cycles(writer, track, cycles[task], sim_ns, arrows[task])
+            _write_cycles(writer, track, cycles[task], recording.layout.clock_ns, arrows[task])
             show_progress((number + 1) / len(tracks))
         _write_cores(recording, writer)
         _write_events(recording, writer, tracks)
@@ -182,9 +178,13 @@ def _find_readings(
         first = np.searchsorted(rows["start_ns"], stamps)
     # Readers of a queue take every message, and others only the newest one.
     taken = (first < len(cycles)) & ((np.diff(first, append=-1) != 0) | (box.protocol == "queue"))
+    # A flight recorder does not know what was read first after a gap.
+    stretches = recording.find_stretches(visible)
+    reader_stretches = recording.find_stretches(rows["tick"])
     for row in np.flatnonzero(taken).tolist():
         cycle = int(cycles[first[row]])
-        if stamps[row] <= rows["read_ns"][cycle]:
+        is_before = stamps[row] <= rows["read_ns"][cycle]
+        if is_before and stretches[row] == reader_stretches[cycle]:
             yield row, cycle
 
 
@@ -192,7 +192,7 @@ def _write_cycles(
     writer: PerfettoWriter,
     track: int,
     rows: np.ndarray,
-    sim_ns: np.ndarray,
+    clock_ns: int,
     arrows: Mapping[int, Sequence[int]],
 ) -> None:
     """Write the cycles of a task.
@@ -201,21 +201,17 @@ def _write_cycles(
         writer: Writer of the trace.
         track: Number of the task's track.
         rows: Trace records of the task.
-        sim_ns: Simulated time of their releases.
+        clock_ns: Length of a tick.
         arrows: Numbers of the arrows that end at a cycle, by index of the cycle.
     """
-    late = compute_lateness_ns(rows)
     missed = find_missed_cycles(rows)
     skipped = count_skipped_releases(rows)
     for cycle, row in enumerate(rows):
         start, read, process, end = (
             int(row[name]) for name in ("start_ns", "read_ns", "process_ns", "end_ns")
         )
-        values = {
-            "tick": int(row["tick"]),
-            "sim_ns": int(sim_ns[cycle]),
-            "late_ns": int(late[cycle]),
-        }
+        tick = int(row["tick"])
+        values = {"tick": tick, "sim_ns": tick * clock_ns}
         if skipped[cycle]:
             writer.add(track, start, INSTANT, "skipped", {"releases": int(skipped[cycle])})
         writer.add(track, start, BEGIN, "cycle", values)
@@ -233,11 +229,10 @@ def _write_cores(recording: Recording, writer: PerfettoWriter) -> None:
     """Write the cycles on each core. A cycle that preempted another one is shown within it."""
     spans: dict[int, list[tuple[int, int, str]]] = defaultdict(list)
     for task in recording.layout.tasks:
-        rows = recording.read_trace(task.name)
-        # Of cycles that start at the same time, the longest comes first.
-        ends = (-rows["end_ns"]).tolist()
         core, _ = recording.find_core_and_priority(task)
-        spans[core] += zip(rows["start_ns"].tolist(), ends, [task.name] * len(rows), strict=True)
+        for row in recording.read_trace(task.name):
+            # Of cycles that start at the same time, the longest comes first.
+            spans[core].append((int(row["start_ns"]), -int(row["end_ns"]), task.name))
     group = writer.add_track("cores")
     for core, cycles in sorted(spans.items()):
         track = writer.add_track(f"core {core}", group)

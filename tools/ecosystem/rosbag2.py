@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from heapq import merge
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -23,7 +23,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import RosEncoder, RosMessage, RosTopic, convert_name
 from rack.tools.recording.recording import Recording
 
-VERSION = 8
+VERSION: Literal[8] = 8
 """Version of the format."""
 HEAD = ("serial", "tick", "visible_at", "stamp_ns")
 """Columns of a mailbox that each message begins with, under names with the prefix `message_`."""
@@ -108,28 +108,21 @@ class MailboxEncoder:
         self._encoder = encoder
 
     def encode(self, box: MailboxSpec, rows: np.ndarray) -> Iterator[RosMessage]:
-        """Return the messages of a mailbox, oldest first."""
+        """Yield the messages of a mailbox, oldest first. The type is declared before the first."""
         type_name = name_type(box.message)
         head = ["std_msgs/Header header", *(f"int64 message_{name}" for name in HEAD)]
         definition = self._declare(box.message, box.fields, head)
         header, _ = self.store.generate_msgdef(HEADER, ros_version=2)
         self.definitions[type_name] = f"{definition}{SEPARATOR}\nMSG: std_msgs/Header\n{header}"
-        return self._encode_rows(
-            box, RosTopic(f"/mailbox/{convert_name(box.name)}", type_name), rows
-        )
-
-    def _encode_rows(
-        self, box: MailboxSpec, topic: RosTopic, rows: np.ndarray
-    ) -> Iterator[RosMessage]:
-        """Yield the rows of a mailbox as messages of a declared type."""
+        topic = RosTopic(f"/mailbox/{convert_name(box.name)}", type_name)
         for first in range(0, len(rows), BLOCK_ROWS):
             block = rows[first : first + BLOCK_ROWS]
             ticks = block["tick"].tolist()
             headers = [self._encoder.build_header(tick) for tick in ticks]
-            head = [headers, *(block[name].tolist() for name in HEAD)]
-            messages = self._build(box.message, box.fields, block["message"], head)
+            columns = [headers, *(block[name].tolist() for name in HEAD)]
+            messages = self._build(box.message, box.fields, block["message"], columns)
             for tick, message in zip(ticks, messages, strict=True):
-                data = self.store.serialize_cdr(message, topic.type_name)
+                data = self.store.serialize_cdr(message, type_name)
                 yield RosMessage(self._encoder.compute_time(tick), topic, data)
 
     def _declare(self, message: str, fields: Sequence[FieldSpec], head: Sequence[str] = ()) -> str:

@@ -80,13 +80,6 @@ class Signal(Column):
         return "" if self.spec.values or self.is_text or unit == "1" else unit
 
     @property
-    def json_type(self) -> str:
-        """JSON type of a single value of the signal."""
-        if self.is_text or self.spec.values:
-            return "string"
-        return "number" if np.dtype(self.spec.kind).kind == "f" else "integer"
-
-    @property
     def heading(self) -> str:
         """Name and unit, as the heading of a column."""
         return f"{self.name}, {self.unit}".removesuffix(", ")

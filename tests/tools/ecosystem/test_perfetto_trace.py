@@ -147,6 +147,22 @@ def test_arrows_lead_from_the_newest_visible_message_to_its_reader(recording: Re
     }
 
 
+def test_no_arrow_crosses_a_gap_of_a_flight_recorder(small: Path, tmp_path: Path) -> None:
+    config = load(small, ["clock.mode=realtime"])
+    gap = range(96, 1000)
+    lower = [Cycle(tick, PLAIN) for tick in range(END) if tick not in gap]
+    upper = [Cycle(tick, PLAIN, late=1.0) for tick in range(0, END, PERIOD) if tick not in gap]
+    rows = write_messages(config)["lower.status"]
+    messages = {"lower.status": rows[~np.isin(rows["tick"], gap)]}
+    run = recorded(tmp_path / "run", config, {"lower": lower, "upper": upper}, (), messages)
+    run.kept = [(0, gap.start), (gap.stop, END)]
+    _, begins, _ = decode(export(run))
+    starts = {mark.start for mark in begins.values()}
+    last = (gap.start - 1) * TICK_NS + MS // 2
+    assert last not in starts
+    assert {last - PERIOD * TICK_NS, (gap.stop + PERIOD - 1) * TICK_NS + MS // 2} <= starts
+
+
 def test_a_core_shows_executors_within_the_plan_that_they_preempted(recording: Recording) -> None:
     slices, _, _ = decode(export(recording))
     core = [s for s in slices if s.track.startswith("core ") and s.name.startswith("lower")]
