@@ -48,6 +48,7 @@ COMMANDS = {
         "picture": "Draw the viewer's first view of a run, or its cell.",
         "export": "Write a recorded run as an MCAP file.",
         "report": "Report on a recorded run, or compare two runs.",
+        "bridge": "Connect a running rack to ROS 2 or Foxglove.",
     },
     "Command and disturb": {
         "command": "Command one level of a running rack.",

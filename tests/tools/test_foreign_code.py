@@ -113,6 +113,7 @@ ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
 }
 """Arguments with which each command is tried, on a rack that runs and on a run."""
 AS_PROCESSES = {
+    "bridge": lambda spied: (spied.rack, "foxglove"),
     "top": lambda spied: (spied.rack,),
     "record": lambda spied: (spied.rack, "--out", spied.run.parent / "recorded"),
 }
@@ -252,7 +253,11 @@ def has_attached(pid: int, rack_name: str) -> bool:
 
 @pytest.mark.slow
 def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(guarded.marker.parent)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(guarded.marker.parent),
+        "FOXGLOVE_PORT": "0",
+    }
     started = {
         command: subprocess.Popen(
             [*RACK, command, *map(str, arguments(guarded))],

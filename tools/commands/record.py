@@ -13,12 +13,12 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import RETAINED_S
 from rack.tools.commands.replay import merge_runs
-from rack.tools.commands.status import find_run_folder
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, check_local_rack_name, option
 from rack.tools.launch.folder import choose_run_folder
 from rack.tools.recording.checksums import CHECKSUMS
+from rack.tools.recording.current_run import find_run_folder
 from rack.tools.recording.divergence import find_tick_range
 from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, PUBLISHED, SPOOL
 from rack.tools.recording.folder_size import (

@@ -73,6 +73,8 @@ def run(
         "--no-record", "leave no folder: no trace, no signals, no report", False
     ),
     view: View = False,
+    ros2: bool = option("--ros2", "show the rack to nodes of ROS 2; see 'rack bridge'", False),
+    foxglove: bool = option("--foxglove", "show the rack in Foxglove; see 'rack bridge'", False),
     share: bool = option(
         "--share",
         "run even on cores of another rack's real-time boards, although both will be late",
@@ -107,6 +109,7 @@ def run(
       rack run nasrem --lockstep --seconds 5 --no-record --json | jq -r .digest
       rack run nasrem --faults bad-sensors --out runs/sensors
       rack run nasrem --set clock.speed=2 --view
+      rack run nasrem --ros2 --foxglove
       rack run nist-state-table --lockstep --step
       rack run ibm --lockstep --entries runs/ibm-20250101-120000
       rack run nasrem --lockstep --out runs/whole
@@ -116,16 +119,18 @@ def run(
         raise Failure("--view and --no-record: the viewer shows what is recorded; leave one out", 2)
     if (config is None) == (origin is None):
         raise Failure("give either CONFIG or --from RUN@TIME; see --help", 2)
-    overrides = list(settings)
-    overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
-    overrides += [f"clock.speed={speed}"] if speed is not None else []
-    if origin is not None and entries is not None:
-        raise Failure("--entries and --from: --from replays the entries anyway; leave one out", 2)
     if origin is not None:
+        if entries is not None:
+            raise Failure(
+                "--entries and --from: --from replays the entries anyway; leave one out", 2
+            )
+        lockstep = True
         from rack.tools.launch.continued import find_run_config, open_beginning
 
         config = str(find_run_config(origin))
     assert config is not None
+    overrides = [*settings, *["clock.mode=lockstep"] * lockstep]
+    overrides += [f"clock.speed={speed}"] if speed is not None else []
     tables_read = assemble(config, overrides, faults)
     crate = _preload_levels(context.obj, tables_read.tables)
     from rack.boards.config.loader import validate
@@ -162,6 +167,7 @@ def run(
                 view=view,
                 share=share,
                 step=step,
+                bridges=["ros2"] * ros2 + ["foxglove"] * foxglove,
                 beginning=begins,
             )
         report = _report_run(rack_config, folder, result)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -10,14 +10,13 @@ from typing import Annotated
 import typer
 
 from rack.backplane.segment import Segment, list_racks
-from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import Json, check_local_rack_name, complete_rack_name, option
 from rack.tools.console.pictures import check_picture_path
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.snapshot import RackMonitor
-from rack.tools.recording.file_names import SPOOL
+from rack.tools.recording.current_run import find_run_folder
 from rack.tools.recording.folder_size import format_recorded_line, measure_size
 
 OnlyRack = Annotated[
@@ -83,20 +82,3 @@ def find_only_rack() -> str:
     if len(running) > 1:
         raise Failure(f"RACK is missing; racks: {', '.join(running)}", 2)
     return running[0]
-
-
-def find_run_folder(segment: Segment) -> Path | None:
-    """Find the folder into which a rack is recorded.
-
-    Returns None if it is not recorded, or if this cannot be seen from this PID namespace.
-    """
-    if not segment.launcher:
-        return None
-    pid = segment.words[System.FOLLOWER_PID]
-    with suppress(OSError):
-        for file in Path(f"/proc/{pid}/fd").iterdir():
-            # A descriptor may be closed while this loop runs.
-            with suppress(OSError):
-                if (path := file.readlink()).name == SPOOL:
-                    return path.parent
-    return None

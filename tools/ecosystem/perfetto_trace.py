@@ -119,8 +119,7 @@ def export_trace(recording: Recording, path: Path, show_progress: Callable[[floa
         }
         arrows = _write_messages(recording, writer, tracks)
         for number, (task, track) in enumerate(tracks.items()):
-            sim_ns = cycles[task]["tick"] * recording.layout.clock_ns
-            _write_cycles(writer, track, cycles[task], sim_ns, arrows[task])
+            _write_cycles(writer, track, cycles[task], recording.layout.clock_ns, arrows[task])
             show_progress((number + 1) / len(tracks))
         _write_cores(recording, writer)
         _write_events(recording, writer, tracks)
@@ -193,7 +192,7 @@ def _write_cycles(
     writer: PerfettoWriter,
     track: int,
     rows: np.ndarray,
-    sim_ns: np.ndarray,
+    clock_ns: int,
     arrows: Mapping[int, Sequence[int]],
 ) -> None:
     """Write the cycles of a task.
@@ -202,7 +201,7 @@ def _write_cycles(
         writer: Writer of the trace.
         track: Number of the task's track.
         rows: Trace records of the task.
-        sim_ns: Simulated time of their releases.
+        clock_ns: Length of a tick.
         arrows: Numbers of the arrows that end at a cycle, by index of the cycle.
     """
     missed = find_missed_cycles(rows)
@@ -211,7 +210,8 @@ def _write_cycles(
         start, read, process, end = (
             int(row[name]) for name in ("start_ns", "read_ns", "process_ns", "end_ns")
         )
-        values = {"tick": int(row["tick"]), "sim_ns": int(sim_ns[cycle])}
+        tick = int(row["tick"])
+        values = {"tick": tick, "sim_ns": tick * clock_ns}
         if skipped[cycle]:
             writer.add(track, start, INSTANT, "skipped", {"releases": int(skipped[cycle])})
         writer.add(track, start, BEGIN, "cycle", values)

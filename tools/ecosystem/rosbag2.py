@@ -119,8 +119,8 @@ class MailboxEncoder:
             block = rows[first : first + BLOCK_ROWS]
             ticks = block["tick"].tolist()
             headers = [self._encoder.build_header(tick) for tick in ticks]
-            head = [headers, *(block[name].tolist() for name in HEAD)]
-            messages = self._build(box.message, box.fields, block["message"], head)
+            columns = [headers, *(block[name].tolist() for name in HEAD)]
+            messages = self._build(box.message, box.fields, block["message"], columns)
             for tick, message in zip(ticks, messages, strict=True):
                 data = self.store.serialize_cdr(message, type_name)
                 yield RosMessage(self._encoder.compute_time(tick), topic, data)

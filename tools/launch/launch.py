@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
@@ -15,7 +15,7 @@ from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
-from rack.boards.events import Event, Outcome
+from rack.boards.events import Event, EventKind, Outcome
 from rack.boards.wiring import Continuation, RecordedEntries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
@@ -48,11 +48,12 @@ COUNTED_WORDS = (
 """Words of a task's control block that are copied to the result of a run."""
 UNFINISHED_HINT = "no time for the report: 'rack report {}' makes it"
 VIEWER = "rack.tools.viewer.window"
-"""Module of the viewer, imported by name because running and recording do not need it."""
+BRIDGES = "rack.tools.bridges.process"
+"""Modules of the viewer and of bridges, imported by name because no run needs them."""
 NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
 
 News = Callable[[], list[str]]
-"""Function that returns new messages of the recorder or the viewer for the user."""
+"""Function that returns new messages of the recorder, the viewer or a bridge for the user."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ def run_rack(
     view: bool = False,
     share: bool = True,
     step: bool = False,
+    bridges: Sequence[str] = (),
     beginning: Beginning = FROM_START,
 ) -> RunResult:
     """Run a rack, and record it.
@@ -149,6 +151,7 @@ def run_rack(
         view: True to open a viewer on the recorder. The user may close it at any time.
         share: As in `Rack`.
         step: True to hold the rack before tick 0 until it is stepped. Only in lockstep.
+        bridges: Names of bridges to other tools.
         beginning: Crate, snapshot and entries of a run that is continued or repeated.
 
     Raises:
@@ -180,22 +183,25 @@ def run_rack(
             rack.events.extend(beginning.earlier)
             segment = rack.segment
             segment.words[System.HOLD_AT] = int(step)
-            news: list[News] = []
+            news: list[tuple[EventKind, News]] = []
             if recorder is not None:
-                news.append(recorder.read_notices)
+                news.append(("recorder", recorder.read_notices))
                 create_run_folder(recorder.folder, config, log, beginning.origin)
                 port = import_module(VIEWER).find_free_port() if view else None
                 if not recorder.attach(config.name, port, segment.words):
                     log.add_event(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
                 if port is not None:
-                    news.append(_open_viewer(port))
+                    news.append(("recorder", import_module(VIEWER).open_window(port)))
+            news += [
+                ("printed", import_module(BRIDGES).start_bridge(name, config.name, stack))
+                for name in bridges
+            ]
 
         def log_news() -> None:
-            """Log new messages of the recorder and the viewer."""
-            for text in [text for source in news for text in source()]:
-                log.add_event(
-                    Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text)
-                )
+            """Log new messages of the recorder, the viewer and the bridges."""
+            for kind, read_notices in news:
+                for text in read_notices():
+                    log.add_event(Event(time.time_ns(), segment.words[System.TICK], kind, "", text))
 
         unfinished = UNFINISHED_HINT.format(folder) if folder else ""
         with INTERRUPT.stop_orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
@@ -291,21 +297,6 @@ def build_result(
             queue.mailbox: queue.refused for queue in list_queue_fills(NewestMessages(segment))
         },
     )
-
-
-def _open_viewer(port: int) -> News:
-    """Open the viewer on the recorder's port.
-
-    The returned function returns new messages of the viewer. If the viewer is missing, its only
-    message is the reason.
-    """
-    window = import_module(VIEWER)
-    try:
-        opened: News = window.ViewerWindow(window.format_url(port)).read_notices
-        return opened
-    except Failure as failure:
-        news = [f"no viewer: {failure}"]
-        return lambda: [news.pop()] if news else []
 
 
 def _watch_rack(

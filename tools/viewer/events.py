@@ -6,11 +6,11 @@ The lane of a board shows the kind of the board's last event, until the next eve
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rack.boards.events import Event
-from rack.tools.recording.checksums import parse_checked_line
+from rack.tools.recording.current_run import EventFile
 from rack.tools.viewer.cell import MarkWriter
 from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, style_lane, write_span
@@ -56,12 +56,11 @@ class EventWriter:
         marks: MarkWriter | None,
     ) -> None:
         self._stream = stream
-        self._path = path
+        self._file = EventFile(path)
         self._names = names
         self._mark_lost = mark_lost
         self._lost: set[str] = set()
         self._marks = marks
-        self._read = 0
         self._waiting: list[Event] = []
         self._lanes: dict[str, str] = {}  # state that each board's lane shows
 
@@ -71,27 +70,11 @@ class EventWriter:
         Args:
             tick: Tick before which all rows have been written. Later events wait for their rows.
         """
-        self._waiting += self._read_new_events()
+        self._waiting += self._file.read_new_events()
         due = [event for event in self._waiting if event.tick < tick]
         self._waiting = [event for event in self._waiting if event.tick >= tick]
         for event in sorted(due, key=get_cause_order):
             self._write(event)
-
-    def _read_new_events(self) -> Iterator[Event]:
-        """Yield the events that were added to the file since the last call."""
-        if not self._path.is_file():
-            return
-        with self._path.open("rb") as file:
-            file.seek(self._read)
-            # A line that is still incomplete is read in the next call.
-            lines = [line for line in file if line.endswith(b"\n")]
-        self._read += sum(map(len, lines))
-        for line in lines:
-            event = parse_checked_line(line.decode())
-            # The last line is the outcome, not an event. Leave out messages about waiting during
-            # the launch, because the launch is over when the view is open.
-            if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
-                yield Event(**event)
 
     def _write(self, event: Event) -> None:
         """Write an event to the log and its lane. Faults and lost boards go to other views too."""

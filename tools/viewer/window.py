@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -104,6 +105,19 @@ class ViewerWindow:
                 os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.wait()
         self._said.close()
+
+
+def open_window(port: int) -> Callable[[], list[str]]:
+    """Open the viewer on a recorder's port.
+
+    The returned function returns new messages of the viewer. If the viewer is missing, its only
+    message is the reason.
+    """
+    try:
+        return ViewerWindow(format_url(port)).read_notices
+    except Failure as failure:
+        news = [f"no viewer: {failure}"]
+        return lambda: [news.pop()] if news else []
 
 
 def has_screen() -> bool:

@@ -11,10 +11,10 @@ import pytest
 from rack.backplane.words import Head, System
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.commands.status import find_run_folder
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
+from rack.tools.recording.current_run import find_run_folder
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import build_report
