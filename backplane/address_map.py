@@ -16,7 +16,7 @@ CACHE_LINE = 64
 """Size of a cache line, in bytes. Blocks of different writers never share a cache line."""
 
 HEAD_SIZE = PAGE
-BLOCK_SIZE = 5 * CACHE_LINE
+BLOCK_SIZE = 6 * CACHE_LINE
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 192
 ALARM_DEPTH = 256

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rack.backplane.message import Message
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 18
+VERSION = 19
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words that contain the addresses of the texts. The word after each contains the size."""
 PREFIX = "nasrem-rack."

@@ -255,6 +255,16 @@ class Examination:
             self._build_task_wiring(layout, ports, ports.task in failing)
             for ports in self._wiring.tasks
         )
+        wirings = {task.task: task for task in tasks}
+        tasks += tuple(
+            replace(
+                wirings[place.board],
+                task=place.name,
+                guards_clock=False,
+                fails_self_test=place.name in failing,
+            )
+            for place in config.list_standbys()
+        )
         hosts = tuple(
             HostWiring(
                 board=(name := ports.place.board),

@@ -54,8 +54,14 @@ def _to_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _to_list(value: Any) -> Any:
+    """Convert a single table or a list of tables to a tuple. Return other values unchanged."""
+    return (value,) if isinstance(value, Mapping) else _to_tuple(value)
+
+
 RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(_to_list)]
 Neighbours = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
 Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_to_tuple)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
@@ -205,6 +211,20 @@ class SupervisionConfig(Table):
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
+class StandbyConfig(Table):
+    """`[board.<name>] standby`: place of a further copy of the executor, or a list of two places.
+
+    See `rack.backplane.standby`.
+    """
+
+    slot: Slot
+    """slot in the crate"""
+    core: Core = 0
+    """core of the copy; this machine must have it"""
+    priority: Priority | None = None
+    """SCHED_FIFO priority of the copy; default: the board's"""
+
+
 class PlacedConfig(Table):
     """Keys that boards of levels and the board of the network adapter have in common."""
 
@@ -266,6 +286,13 @@ class BoardConfig(PlacedConfig):
     """maximum-urgency-first runs critical boards before others"""
     transfer: TransferConfig = TransferConfig()
     """emulation of a slower bus for this board"""
+    standby: Standbys = ()
+    """further copy of the executor, which takes over its mailboxes when it is lost, or a list"""
+    compare: bool = False
+    """raise an alarm, one cycle later, when a standby computes other messages; the level must be
+    deterministic"""
+    vote: bool = False
+    """with two standbys: the copy that differs from the two others is taken out and restarted"""
     ends_run: bool = False
     """end the run when this level's status is done or error"""
     on_loss: OnLoss = "hold"
@@ -408,7 +435,7 @@ class TaskEntry(NamedTuple):
     Attributes:
         name: Name of the task, as in "servo" or "servo.planner".
         board: Name of its board.
-        role: "executor", "planner" or "host".
+        role: "executor", "planner", "standby" or "host".
         target: Its class, as "package.module:Class".
         slot: Its slot.
         core: The core that it requests.
@@ -431,7 +458,7 @@ class TaskEntry(NamedTuple):
     @property
     def class_key(self) -> str:
         """Key of the task's table that names the class of the task."""
-        return "program" if self.role == "host" else self.role
+        return {"host": "program", "standby": "executor"}.get(self.role, self.role)
 
     @property
     def reads_key(self) -> str:
@@ -558,6 +585,20 @@ class RackConfig(Table):
                     slot,
                     core,
                     board.planner_priority,
+                )
+
+    def list_standbys(self) -> Iterator[TaskEntry]:
+        """Yield the standbys of all boards, as in "servo.standby" and "servo.standby2"."""
+        for name, board in self.board.items():
+            for number, standby in enumerate(board.standby, start=1):
+                yield TaskEntry(
+                    f"{name}.standby{number if number > 1 else ''}",
+                    name,
+                    "standby",
+                    board.executor,
+                    standby.slot,
+                    standby.core,
+                    board.priority if standby.priority is None else standby.priority,
                 )
 
     def list_hosts(self) -> Iterator[TaskEntry]:

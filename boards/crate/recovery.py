@@ -41,7 +41,11 @@ class RestartPolicy:
         self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.find_boards_below(task.board)
-            needed = {other.name for other in layout.tasks if other.board in below}
+            needed = {
+                other.name
+                for other in layout.tasks
+                if other.board in below and other.role != "standby"
+            }
             self._needs[task.name] = {CLOCK, *needed} | (
                 {task.board} if task.role == "planner" else set()
             )

@@ -124,7 +124,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
     copier = Copier(segment, wiring.task, copies) if has_snapshots_enabled(segment) else None
     block = segment.get_block(wiring.task)
     kind: type[Executor] | type[Planner] = find_class(
-        wiring.target, Executor if spec.role == "executor" else Planner
+        wiring.target, Planner if spec.role == "planner" else Executor
     )
     level = kind(wiring.context)
     if isinstance(level, Adapter):

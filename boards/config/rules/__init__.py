@@ -12,7 +12,7 @@ from importlib import import_module
 from types import ModuleType
 
 from rack.boards.config.connections import Wiring
-from rack.boards.config.rules import boards, levels, mailboxes
+from rack.boards.config.rules import boards, levels, mailboxes, standbys
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake, Mistakes
 
@@ -57,6 +57,7 @@ RULES: tuple[Rule, ...] = (
     mailboxes.check_queues,
     mailboxes.check_asynchronous,
     mailboxes.check_interrupts,
+    standbys.check_standbys,
     levels.check_params,
     levels.check_programs,
     levels.check_cell,
