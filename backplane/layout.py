@@ -278,13 +278,10 @@ class Layout:
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
     def list_copies(self, task: str) -> tuple[TaskSpec, ...]:
-        """Return all copies of an executor: itself, followed by its standbys in their order."""
+        """Return a task, followed by its standbys in their order."""
         spec = self.find_task(task)
-        return tuple(
-            other
-            for other in self.tasks
-            if other == spec or (other.role == "standby" and other.board == spec.name)
-        )
+        standbys = (s for s in self.tasks if s.role == "standby" and s.board == spec.name)
+        return (spec, *standbys)
 
     def find_pacers(self, host: TaskSpec) -> set[str]:
         """Return the bus adapters that share a mailbox with a host board.

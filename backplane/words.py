@@ -281,6 +281,10 @@ class Box:
     # Of a queue: serial of the newest message taken, times 3. See `queue.QueueReader`.
     POSITION = 11
     FIRST = 12  # serial of the newest message before this run, see `Block.TRACE_FIRST`
+    # This word and the two after it: serial of the newest message when an epoch began, of epoch e
+    # in word BEGUN + e % EPOCHS. A message of an earlier epoch has no greater serial.
+    BEGUN = 13
+    EPOCHS = 3
 
 
 class Slot:

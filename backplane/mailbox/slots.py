@@ -276,12 +276,22 @@ class Slots:
     def is_from_claimant(self, known: int) -> bool:
         """Check whether the writer of the local message held the claim on the mailbox.
 
+        A message of an earlier writer was published before the next epoch began. A writer that was
+        stopped, and whose mailbox a standby has taken over, may store one more message. Its serial
+        is greater.
+
         Args:
             known: Signature of the last message accepted by the caller, 0 for none. Messages from
                 earlier epochs than this one are rejected.
         """
         signature = self.signature
         holder = self.box[Box.CLAIMANT]
-        return signature in (known, holder) or get_epoch(known) < get_epoch(signature) < get_epoch(
-            holder
-        )
+        if signature == holder:
+            return True
+        epoch = get_epoch(signature)
+        newest = get_epoch(holder)
+        if signature != known and not get_epoch(known) < epoch < newest:
+            return False
+        # Epochs that began too long ago have no word any more. The oldest word is a bound for them.
+        following = max(epoch + 1, newest - Box.EPOCHS + 1)
+        return epoch < newest and self.serial <= self.box[Box.BEGUN + following % Box.EPOCHS]

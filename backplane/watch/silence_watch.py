@@ -84,6 +84,7 @@ class SilenceWatch(MessageWatch):
         self._stale_after = STALE_CYCLES * spec.every
         self._task = task
         self.block = segment.get_block(spec.writer)
+        self._copies = segment.get_copy_blocks(spec.writer)
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
@@ -119,7 +120,9 @@ class SilenceWatch(MessageWatch):
         """
         # A loss takes effect one tick after it was found. In the same tick, the result would depend
         # on which process is faster.
-        return self._reader.newest != NO_MESSAGE_TICK and 0 < self.block[Block.LOST] <= tick
+        if not 0 < self.block[Block.LOST] <= tick or self._reader.newest == NO_MESSAGE_TICK:
+            return False
+        return all(0 < block[Block.LOST] <= tick for block in self._copies)
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a cycle without writing the message due in it."""

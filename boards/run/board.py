@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib import import_module
 from socket import socket
 from zlib import crc32
 
@@ -30,11 +31,13 @@ from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import TaskCopies, has_snapshots_enabled
 from rack.boards.run.system_controller import run_clock
+from rack.boards.run.task import Task
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
 
+REPLICA = "rack.boards.run.replica"
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
 REPEATS_FACTOR = 1 << 16
@@ -145,11 +148,14 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         hold_memory(lockstep)
         if isinstance(level, Adapter):
             level.open_connections()
-        task = (
-            VirtualControlLoop(segment, wiring, level, attention)
-            if isinstance(level, Executor)
-            else PlannerLoop(segment, wiring, level, attention)
-        )
+        task: Task
+        if isinstance(level, Planner):
+            task = PlannerLoop(segment, wiring, level, attention)
+        elif len(segment.layout.list_copies(spec.board)) > 1:
+            # Import it only in racks that have standbys.
+            task = import_module(REPLICA).ReplicatedLoop(segment, wiring, level, attention)
+        else:
+            task = VirtualControlLoop(segment, wiring, level, attention)
         if copier is not None:
             task.next_cycle.copy = TaskCopies(task, level, copier, attention)
         block[Block.STATE] = TaskState.READY

@@ -37,10 +37,12 @@ from rack.boards.wiring import ClockWiring
 from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer, Operation
 
 if TYPE_CHECKING:
+    from rack.boards.run.hand_over import HandOverDirector
     from rack.boards.run.scheduling import SchedulerChanges
     from rack.boards.run.simulated_cores import SimulatedCores
 
 SCHEDULING = "rack.boards.run.scheduling"
+HAND_OVER = "rack.boards.run.hand_over"
 SIMULATED_CORES = "rack.boards.run.simulated_cores"
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
@@ -74,6 +76,10 @@ class SystemController:
             self._desk.changes = import_module(SCHEDULING).SchedulerChanges(
                 segment, driver.tasks, wiring.schedulings, driver.alarms
             )
+        self._hand_overs: HandOverDirector | None = None
+        if any(task.role == "standby" for task in segment.layout.tasks):
+            # Import it only in racks that have standbys.
+            self._hand_overs = import_module(HAND_OVER).HandOverDirector(segment, driver)
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
         self.cores: SimulatedCores | None = None
@@ -87,6 +93,8 @@ class SystemController:
             faults.advance_faults(tick)
         if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
             desk.issue_due_commands(tick)
+        if self._hand_overs is not None:
+            self._hand_overs.check_active_copies()
         if self._settled != (
             words[System.LOSSES],
             self._driver.watchdog.losses,
@@ -125,7 +133,9 @@ class SystemController:
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
         demands = [
-            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
+            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index)
+            for task in lost
+            if self._hand_overs is None or not self._hand_overs.is_served(task)
         ]
         if emergency:
             demands.append((Demand.BRAKE, -1))
