@@ -123,12 +123,14 @@ class Writer:
         A standby that takes over from a stopped process gets it only when that process has ended.
         """
         if not is_held:
-            self.claim_mailbox()
-            self._continue_messages()
+            self._continue_after(self.claim_mailbox())
         _WRITERS.add(self)
 
-    def claim_mailbox(self) -> None:
+    def claim_mailbox(self) -> int:
         """Claim the mailbox in a new epoch.
+
+        Returns:
+            Serial of the newest message of the previous writer.
 
         Raises:
             MailboxError: The mailbox has another writer.
@@ -137,7 +139,7 @@ class Writer:
             pid = self._claimed[Box.WRITER_PID]
             self._claim.close()
             raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
-        self._begin_epoch()
+        return self._begin_epoch()
 
     def take_over(self) -> None:
         """Claim the mailbox in a new epoch, even if the process of its writer is alive.
@@ -146,8 +148,7 @@ class Writer:
         it holds the lock on the hand-over: see `rack.backplane.standby`.
         """
         self.try_lock()
-        self._begin_epoch()
-        self._continue_messages()
+        self._continue_after(self._begin_epoch())
 
     @property
     def holds_claim(self) -> bool:
@@ -164,22 +165,34 @@ class Writer:
         self.has_claim = self.is_locked = False
         self._claim.release()
 
-    def _begin_epoch(self) -> None:
-        """Enter this process in the head of the mailbox as its writer."""
+    def _begin_epoch(self) -> int:
+        """Enter this process in the head of the mailbox as its writer.
+
+        Returns:
+            Serial of the newest message of the previous writer.
+        """
         box = self._claimed
         epoch = get_epoch(box[Box.EPOCH] + 1)
-        # Store this word first, so that a reader that finds the new claim finds its word too.
-        box[Box.BEGUN + epoch % Box.EPOCHS] = box[Box.HEAD]
+        # A previous writer that was stopped may store this word again at any time, so load it once.
+        head = box[Box.HEAD]
+        box[Box.BEGUN + epoch % Box.EPOCHS] = head
+        # A reader that finds the new claim must find the word that belongs to it.
+        self.slots.fence()
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch
         # Epoch and process are stored in one word, so that no reader sees half a claim.
-        box[Box.CLAIMANT] = self.slots.signature = build_signature(epoch, os.getpid())
+        box[Box.CLAIMANT] = signature = build_signature(epoch, os.getpid())
+        # The word of the checksum depends on the signature: see `Slots.chain`.
+        chain = self.slots.chain
+        self.slots.signature = signature
+        self.slots.chain = chain
         self.has_claim = True
+        return head
 
-    def _continue_messages(self) -> None:
-        """Continue after the newest message of the previous writer."""
-        self.slots.clear_unpublished()
-        self.slots.resume_writing(self.slots.signature)
+    def _continue_after(self, head: int) -> None:
+        """Continue after the newest message of the previous writer, which has this serial."""
+        self.slots.clear_unpublished(head)
+        self.slots.resume_writing(self.slots.signature, head)
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`.

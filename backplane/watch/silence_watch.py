@@ -83,8 +83,7 @@ class SilenceWatch(MessageWatch):
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._task = task
-        self.block = segment.get_block(spec.writer)
-        self._copies = segment.get_copy_blocks(spec.writer)
+        self.block = self._blocks[0]
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
@@ -104,7 +103,8 @@ class SilenceWatch(MessageWatch):
             # If the writer is already marked as lost, `pid` may be its new process, which is alive
             # but has not written yet.
             if age >= self._stale_after and (
-                self.block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
+                self._blocks[self._active][Block.LOST]
+                or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
                 self._report_silence(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
@@ -122,7 +122,7 @@ class SilenceWatch(MessageWatch):
         # on which process is faster.
         if not 0 < self.block[Block.LOST] <= tick or self._reader.newest == NO_MESSAGE_TICK:
             return False
-        return all(0 < block[Block.LOST] <= tick for block in self._copies)
+        return all(0 < block[Block.LOST] <= tick for block in self._blocks)
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a cycle without writing the message due in it."""

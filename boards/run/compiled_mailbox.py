@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import GOOD_OFFSET, NO_MESSAGE_TICK
-from rack.backplane.mailbox.slots import CHECKED_FROM, SIGNED_FROM, Slots
+from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, SIGNED_FROM, Slots
 from rack.backplane.words import Box, Slot
 from rack.boards.run.instructions import (
     copy,
@@ -114,7 +114,8 @@ def take(port: Any, serial: int) -> bool:
         return False
     if received.signature != load(port.head + _CLAIMANT):
         return False
-    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != received.check:
+    check = received.check ^ (received.signature & EPOCH_MASK)
+    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != check:
         return False
     copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1
@@ -188,8 +189,9 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     record.serial = before + 1
     record.tick = tick
     record.visible = tick + port.delay
-    record.chain = record.check
-    record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
+    epoch = record.signature & EPOCH_MASK
+    record.chain = record.check ^ epoch
+    record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain) ^ epoch
     # Other processes must see the stores in this order: the mailbox's head for the previous
     # message, this message, its signature, and the mailbox's head for this message.
     fence()
