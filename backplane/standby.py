@@ -15,11 +15,22 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from rack.backplane.checked import to_enum
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, HandOver
+
+HAND_OVER_REASONS: Mapping[HandOver, str] = {
+    HandOver.NONE: "no other copy was active before",
+    HandOver.LOST: "the active copy was lost",
+    HandOver.STOPPED: "the active copy was stopped by a signal",
+    HandOver.LATE: "the active copy had not finished its cycle",
+    HandOver.COMMANDED: "an operator has switched",
+    HandOver.STRAYED: "the active copy differed from two others",
+}
+"""Reasons for hand-overs as text."""
 
 
 class Copy(NamedTuple):
@@ -66,6 +77,21 @@ class ReplicatedTask(NamedTuple):
     def active(self) -> Copy:
         """The copy that writes the mailboxes."""
         return next((copy for copy in self.copies if copy.is_active), self.copies[0])
+
+    @property
+    def line(self) -> str:
+        """Description in one line, for tools."""
+        active = self.active
+        others = [
+            f"'{copy.name}' "
+            + ("lost" if copy.is_lost else "differs" if copy.aligned_since is None else "ready")
+            for copy in self.copies
+            if copy is not active
+        ]
+        since = "the start"
+        if self.hand_overs:
+            since = f"tick {self.since_tick} ({HAND_OVER_REASONS[self.reason]})"
+        return f"'{self.name}': '{active.name}' active since {since}; {', '.join(others)}"
 
 
 def list_standbys(segment: Segment) -> tuple[ReplicatedTask, ...]:

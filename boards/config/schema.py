@@ -384,6 +384,7 @@ class CommandConfig(Table):
         "do",
         "set",
         "schedule",
+        "switch",
         "enable",
         "disable",
         "reset",
@@ -392,8 +393,9 @@ class CommandConfig(Table):
     """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
     add or remove a control modification; table: switch to another state table; do: carry out one of
     the level's own commands; set: change a live parameter of the level; schedule: change the
-    scheduler of its board; enable, disable: turn the torque of the arm on or off; reset: clear a
-    fault of its drives; release: end robot.bring_up"""
+    scheduler of its board; switch: hand over to a standby of its board; enable, disable: turn the
+    torque of the arm on or off; reset: clear a fault of its drives; release: end
+    robot.bring_up"""
     tick: Tick | None = None
     """tick at which the command is issued; give at most one of tick, at"""
     at: Moment | None = None

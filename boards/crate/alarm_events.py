@@ -15,6 +15,7 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.message import escape_text
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
+from rack.backplane.standby import HAND_OVER_REASONS
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, open_alarm_ring
 from rack.backplane.words import Demand, HandOver, Scheduler
 from rack.boards.config.cell import find_geom_name
@@ -44,15 +45,6 @@ DEMANDED_BY: Mapping[str, str] = {
 }
 """Reasons why the arm must stop or brake, other than the loss of a board."""
 
-HAND_OVERS: Mapping[HandOver, str] = {
-    HandOver.NONE: "",
-    HandOver.LOST: "the active copy was lost",
-    HandOver.STOPPED: "the active copy was stopped by a signal",
-    HandOver.LATE: "the active copy had not finished its cycle",
-    HandOver.COMMANDED: "an operator has switched",
-    HandOver.STRAYED: "the active copy differed from two others",
-}
-"""Reasons for hand-overs as text."""
 EVENT_KINDS: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
@@ -308,7 +300,7 @@ class AlarmReader:
         if alarm == Alarm.SCHEDULER_KEPT:
             words["scheduler"] = to_enum(Scheduler, float(row["value"])).word
         elif alarm == Alarm.TAKEN_OVER:
-            words["what"] = HAND_OVERS[to_enum(HandOver, float(row["value"]))]
+            words["what"] = HAND_OVER_REASONS[to_enum(HandOver, float(row["value"]))]
         elif about == "mailbox":
             words["writer"] = self._layout.mailboxes[int(row["subject"])].writer
         elif about == "geom":

@@ -99,6 +99,13 @@ class HandOverDirector:
         self._driver.await_state(best, lambda: not words[Block.TAKE_OVER] or best.is_lost)
         return True
 
+    def switch(self, board: str) -> None:
+        """Request a hand-over for an operator, if a standby has the state of the active copy."""
+        for group in self.groups:
+            aligned = [task for task in group.tasks if task.block[Block.ALIGNED] > 0]
+            if group.tasks[0].spec.name == board and any(map(self._is_able, aligned)):
+                self.hand_over(group, HandOver.COMMANDED)
+
     def _is_able(self, task: ReleasedTask) -> bool:
         """Return True if a copy can take over: it runs and, in lockstep, is not late."""
         block = task.block

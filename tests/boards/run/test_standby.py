@@ -120,8 +120,9 @@ def test_a_kill_from_outside_at_any_moment_leaves_the_digest(
                 continue  # on a fast machine the run was ahead of the last restart
             os.kill(task.active.pid, signal.SIGKILL)
             wait_until(
-                lambda number=number: not rack.watch(0.0)
-                or list_standbys(rack.segment)[0].hand_overs >= number
+                lambda number=number: (
+                    not rack.watch(0.0) or list_standbys(rack.segment)[0].hand_overs >= number
+                )
             )
         outcome = end_of(rack)
         (task,) = list_standbys(rack.segment)
@@ -143,8 +144,9 @@ def test_in_real_time_readers_miss_at_most_one_message(
         (before,) = list_standbys(rack.segment)
         os.kill(before.active.pid, number)
         wait_until(
-            lambda: not rack.watch(0.0)
-            or list_standbys(rack.segment)[0].hand_overs > before.hand_overs
+            lambda: (
+                not rack.watch(0.0) or list_standbys(rack.segment)[0].hand_overs > before.hand_overs
+            )
         )
         (after,) = list_standbys(rack.segment)
         if number == signal.SIGSTOP:
