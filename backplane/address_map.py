@@ -33,6 +33,8 @@ CLOCK = "clock"
 
 Its window holds the fault table, the operator table and the operators' mailboxes.
 """
+CLOCK_STANDBY = "clock.standby"
+"""Name of the process that continues the clock when the first one is lost."""
 MAILBOX_HEAD_SIZE = 2 * CACHE_LINE
 SLOT_HEAD_SIZE = 64
 SCRATCH_SIZE = CACHE_LINE

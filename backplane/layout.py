@@ -273,9 +273,24 @@ class Layout:
 
     @property
     def timed(self) -> tuple[MailboxSpec, ...]:
-        """All mailboxes except those written by host boards, which may write at any time."""
+        """All mailboxes except those written by host boards, which may write at any time.
+
+        Also except mailboxes through which the clock is asked to switch to a standby, and which no
+        level reads. A rack with standbys thus has the same digest as without them.
+        """
         hosts = {host.name for host in self.hosts}
-        return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
+        tasks = {task.name for task in self.tasks}
+        replicated = {task.board for task in self.tasks if task.role == "standby"}
+        return tuple(
+            mailbox
+            for mailbox in self.mailboxes
+            if mailbox.writer not in hosts
+            and (
+                mailbox.readers
+                or mailbox.writer in tasks
+                or mailbox.name.partition(".")[0] not in replicated
+            )
+        )
 
     def list_copies(self, task: str) -> tuple[TaskSpec, ...]:
         """Return a task, followed by its standbys in their order."""

@@ -198,6 +198,7 @@ class ClockWiring:
         reservation: Processor time to reserve instead of a priority, None for none.
         schedulings: How executors compete for their cores, by task. Empty if the config names no
             scheduler.
+        copy: Number of this process among those that can run the clock, None if it is the only one.
     """
 
     lockstep: bool
@@ -215,3 +216,4 @@ class ClockWiring:
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
     schedulings: Mapping[str, Scheduling]
+    copy: int | None

@@ -21,7 +21,7 @@ from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import find_late_tasks
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.patience import PeerWaitReporter, ReportedWait
-from rack.boards.crate.recovery import UP_STATES, Recovery, RestartPolicy
+from rack.boards.crate.recovery import CLOCKS, UP_STATES, Recovery, RestartPolicy
 from rack.boards.crate.requests import Ended, Forked, ForkFailed
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX, LaunchError
 from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, list_brakings
@@ -105,12 +105,12 @@ class Supervisor:
                 if raised.alarm == Alarm.HANG:
                     task = select_item(self.plan.layout.tasks, raised.subject, "task")
                     self.recovery.kill_hanging(task.name)
-                elif raised.alarm == Alarm.CLOCK_STOPPED and raised.subject == self.pids.get(CLOCK):
+                elif raised.alarm == Alarm.CLOCK_STOPPED:
                     # Kill the clock only if it is still the reported process and not its successor.
-                    self.recovery.kill_hanging(CLOCK)
+                    self._kill_clock(raised.subject)
             for board in self._heartbeat.find_hanging():
                 self.recovery.report_hanging(board)
-                self.recovery.kill_hanging(board)
+                self._kill_hanging(board)
             self._awaited.report_if_due()
             self.recovery.restart_due_boards()
             if not self.is_armed:
@@ -121,6 +121,19 @@ class Supervisor:
             if time.monotonic() >= deadline:
                 break
         return self.outcome is None
+
+    def _kill_hanging(self, board: str) -> None:
+        """Kill a hanging board, or the process that runs the clock."""
+        if board == CLOCK:
+            self._kill_clock(self.segment.words[System.CLOCK_PID])
+        else:
+            self.recovery.kill_hanging(board)
+
+    def _kill_clock(self, pid: int) -> None:
+        """Kill a process if it is the clock or its standby."""
+        for name in CLOCKS:
+            if self.pids.get(name) == pid:
+                self.recovery.kill_hanging(name)
 
     def stop(self, why: str) -> None:
         """End the run at the next tick. Safe to call at any time, even in a signal handler."""
@@ -168,12 +181,12 @@ class Supervisor:
                 self.pids[name] = pid
             case Ended(name, _, status) as end:
                 self.pids.pop(name, None)
-                is_board = name == CLOCK or name in self.segment.map.blocks
+                is_board = name in CLOCKS or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
                     # The restart policy applies to a board that died before the run stopped, even
                     # if its end is reported later.
-                    died_before = name != CLOCK and self.segment.get_block(name)[Block.LOST]
+                    died_before = name not in CLOCKS and self.segment.get_block(name)[Block.LOST]
                     is_late = self._is_stopped and not died_before
                     self.recovery.record_loss(end, is_late, self._record_printed)
             case None:

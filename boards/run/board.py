@@ -24,7 +24,7 @@ from rack.backplane.process import (
     take_core,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Scheduler, System, TaskState
+from rack.backplane.words import Block, Run, Scheduler, System, TaskState
 from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
@@ -37,6 +37,7 @@ from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
 
+CLOCK_LOCK = "rack.boards.run.clock_standby"
 REPLICA = "rack.boards.run.replica"
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
@@ -201,6 +202,14 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     # Memory is not touched in advance, because every board waits for the start of the clock. The
     # clock's lead over its grid points leaves enough time for a page fault.
     hold_memory(wiring.lockstep)
+    lock = None
+    if wiring.copy is not None:
+        # Import it only in racks whose clock has a standby.
+        lock = import_module(CLOCK_LOCK).await_clock_lock(segment, is_standby=wiring.copy > 0)
+        if segment.words[System.STATE] == Run.STOPPED:
+            return 0
     with keep_cores_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)
+    if lock is not None:
+        lock.close()
     return 0

@@ -112,10 +112,10 @@ def take(port: Any, serial: int) -> bool:
     state = state_at(port.state)
     if received.serial != serial or received.signature != state.signature:
         return False
-    if received.signature != load(port.head + _CLAIMANT):
-        return False
     check = received.check ^ (received.signature & EPOCH_MASK)
     if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != check:
+        return False
+    if received.signature != load(port.head + _CLAIMANT):
         return False
     copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1

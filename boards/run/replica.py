@@ -38,7 +38,7 @@ MAX_AHEAD = 3
 """Number of messages by which the active copy may be ahead of the cycle that is compared."""
 
 
-class Difference(NamedTuple):
+class FieldDifference(NamedTuple):
     """First field in which a message of a copy differs from that of the active copy."""
 
     mailbox: str
@@ -156,7 +156,7 @@ class Replica:
         """True if this copy writes the mailboxes."""
         return bool(self._group[Block.ACTIVE] == self.number)
 
-    def begin_cycle(self, tick: int, is_late: bool) -> Difference | None:
+    def begin_cycle(self, tick: int, is_late: bool) -> FieldDifference | None:
         """Do what is due before the cycle released at `tick` reads its inputs.
 
         Args:
@@ -270,7 +270,7 @@ class Replica:
         is_worse = is_late or not self._block[Block.ALIGNED]
         return HandOver.NONE if is_worse else HandOver.LATE
 
-    def _compare(self, held: int) -> Difference | None:
+    def _compare(self, held: int) -> FieldDifference | None:
         """Compare the messages held back in a cycle with those of the active copy.
 
         Args:
@@ -286,7 +286,7 @@ class Replica:
             if not output.fetch_message(held):
                 is_complete = False
             elif difference is None and (field := output.find_difference()):
-                difference = Difference(output.writer.spec.name, field)
+                difference = FieldDifference(output.writer.spec.name, field)
         if is_complete and difference is None:
             self._block[Block.ALIGNED] = was_aligned or held + 1
             return None

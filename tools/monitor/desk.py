@@ -19,9 +19,9 @@ from rack.backplane.operator_table import (
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Scheduler, System
 from rack.boards.config import read_stored
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.commands import build_request, describe_commands, parse_command
 from rack.boards.config.published import PublishedRack
-from rack.boards.config.schema import CommandConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import copy_request_message, describe_command
 from rack.levels.operator import EFFECTS, Operation

@@ -146,6 +146,8 @@ def check_circles(wiring: Wiring) -> Mistakes:
 def check_slots(wiring: Wiring) -> Mistakes:
     """Check that no two boards have the same slot."""
     taken: dict[int, str] = {}
+    if (clock := wiring.config.clock.standby) is not None:
+        taken[clock.slot] = "clock.standby.slot"
     for name, board in wiring.config.board.items():
         standbys = [
             (f"standby[{number}].slot" if len(board.standby) > 1 else "standby.slot", copy.slot)

@@ -20,6 +20,18 @@ def check_standbys(wiring: Wiring) -> Mistakes:
     """Check that each standby has a core of this machine, and that its level can be replicated."""
     config = wiring.config
     cores = sorted(os.sched_getaffinity(0))
+    places = {
+        f"{place}.standby{f'[{number}]' if len(standbys) > 1 else ''}.core": standby.core
+        for place, standbys in (
+            ("clock", () if config.clock.standby is None else (config.clock.standby,)),
+            *((f"board.{name}", board.standby) for name, board in config.board.items()),
+        )
+        for number, standby in enumerate(standbys)
+    }
+    for place, core in places.items():
+        if core not in cores:
+            why = f"this machine has no such core; cores: {', '.join(map(str, cores))}"
+            yield Mistake(place, core, why)
     executors = {p.task: p for p in wiring.tasks if issubclass(p.kind, Executor)}
     for name, board in config.board.items():
         place = f"board.{name}"
@@ -33,11 +45,6 @@ def check_standbys(wiring: Wiring) -> Mistakes:
         elif board.vote and 0 < count < VOTERS:
             why = f"a vote needs 3 copies, but there are {count + 1}; give {VOTERS} standbys"
             yield Mistake(f"{place}.vote", True, why)
-        for number, standby in enumerate(board.standby):
-            if standby.core not in cores:
-                which = f"[{number}]" if count > 1 else ""
-                why = f"this machine has no such core; cores: {', '.join(map(str, cores))}"
-                yield Mistake(f"{place}.standby{which}.core", standby.core, why)
         if count and name in executors and (why := _find_obstacle(wiring, executors[name])):
             yield Mistake(f"{place}.standby", None, why)
 

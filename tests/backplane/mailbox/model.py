@@ -387,6 +387,9 @@ class _Model:
         elif writer.is_stopped:
             # It sets the head back, or to the serial on which its successor works.
             epochs = [*state.epochs, ()][: max(len(state.epochs), store.value + 1)]
+            words = state.slots[store.value % self._setup.depth]
+            if set(words) == {store.value * EPOCHS + state.claim}:
+                epochs[store.value] = (*epochs[store.value], state.claim)
         else:
             raise Violation("a message is published without the valid claim")
         return state._replace(head=store.value, epochs=tuple(epochs))

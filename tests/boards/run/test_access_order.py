@@ -134,8 +134,7 @@ def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...
 EXPECTED = {
     "publish": PUBLISH,
     "lose": LOSE,
-    # The claim is loaded again to check the writer, which the reader does not know.
-    "first read": (*READ, "load claim"),
+    "first read": READ,
     "read": READ,
     "judge": JUDGE,
     "claim": CLAIM,
