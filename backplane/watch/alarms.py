@@ -59,6 +59,7 @@ class Alarm(IntEnum):
     FLOWS = 7
     # [mailbox; -, the text names the field] a standby computes another message than the active copy
     DIFFERS = 9
+    STRAYED = 15  # [task; -]  this copy of a task differs from two others, and is taken out
     TAKEN_OVER = 14  # [task; HandOver]  this copy of a task writes its mailboxes from this tick
     OPERATOR_GONE = 8  # [entry of the operator table; serial]  a command under a lease: hold
     # Raised by the clock: tasks that miss their cycles.

@@ -71,6 +71,7 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
     "task": {
         Alarm.HANG: "'{subject}' is not responding: {releases} missed since tick {since}",
         Alarm.REJOINED: "'{subject}' rejoined after {span}",
+        Alarm.STRAYED: "'{subject}' differs from the two other copies, and is taken out",
         Alarm.TAKEN_OVER: "'{subject}' has taken over: {what}",
         Alarm.LATE: "'{subject}' missed its deadline: still running at its next release",
         Alarm.PLAN_LATE: "'{subject}' missed its deadline: its plan was not finished",

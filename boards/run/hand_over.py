@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from rack.backplane.clock.driver import ClockDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, HandOver, System
 
 
@@ -57,9 +58,21 @@ class HandOverDirector:
     def check_active_copies(self) -> None:
         """Request a hand-over from each active copy that is lost or, in lockstep, has stopped."""
         for group in self.groups:
+            if stray := group.words[Block.STRAYED]:
+                group.words[Block.STRAYED] = 0
+                self._take_out(group, group.tasks[(stray - 1) % len(group.tasks)])
             active = group.active
             if reason := self._find_reason(active):
                 self.hand_over(group, reason)
+
+    def _take_out(self, group: Copies, stray: ReleasedTask) -> None:
+        """Mark a copy that has strayed as lost. The Rack then kills its process and restarts it."""
+        if stray.is_lost or (stray is group.active and not self.hand_over(group, HandOver.STRAYED)):
+            return
+        tick = self._driver.words[System.TICK]
+        stray.mark_lost(tick)
+        self._driver.watchdog.losses += 1
+        self._driver.alarms.raise_alarm(tick, Alarm.STRAYED, stray.index)
 
     def _find_reason(self, active: ReleasedTask) -> HandOver:
         """Return why a copy must be replaced, or NONE."""

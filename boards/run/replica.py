@@ -14,7 +14,8 @@ has not finished its last cycle. The messages of that cycle would be late, so re
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from importlib import import_module
+from typing import TYPE_CHECKING, NamedTuple
 
 from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
@@ -32,6 +33,10 @@ from rack.boards.run.ports import OutputPorts
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor
 
+if TYPE_CHECKING:
+    from rack.boards.run.vote import Ballot
+
+VOTE = "rack.boards.run.vote"
 STATE_PORT = "state"
 """Output from which a standby is realigned."""
 MAX_AHEAD = 3
@@ -131,6 +136,7 @@ class Replica:
         copies = segment.layout.list_copies(spec.board)
         self.number = copies.index(spec)
         self.held_tick = -1
+        self._late = self._quiet_until = -1
         self._alarms = alarms
         self._index = segment.layout.processes.index(spec)
         self._words = segment.words
@@ -147,6 +153,10 @@ class Replica:
             port: PublishedOutput(segment, writer) for port, writer in outputs.writers.items()
         }
         self._block[Block.ALIGNED] = 0
+        self._ballot: Ballot | None = None
+        if wiring.votes:
+            # Import it only in racks that vote.
+            self._ballot = import_module(VOTE).Ballot(self._blocks, self.number, spec.every)
         outputs.replica = self
         if self.number == 0 and segment.words[System.STATE] == Run.STARTING:
             self._claim_mailboxes()
@@ -183,13 +193,22 @@ class Replica:
         if not self._is_lockstep and (reason := self._find_loss(held, is_late)):
             self.take_over(tick, reason)
             return None
-        return self._compare(held)
+        late = sum(block[Block.MISSED] + block[Block.SKIPPED] for block in self._blocks)
+        if late != self._late:
+            # A level may act differently in the cycle after a late one.
+            self._late = late
+            self._quiet_until = tick + 2 * self._every
+        difference = self._compare(held)
+        return None if tick <= self._quiet_until else difference
 
     def may_write(self, tick: int) -> bool:
         """Return True if this copy is active. Otherwise hold back the messages of the cycle."""
         if self.is_active and all(writer.holds_claim for writer in self._writers):
             return True
         self.held_tick = tick
+        if self._ballot is not None:
+            due = self._list_due(tick)
+            self._ballot.cast(tick, (output.writer.message.raw for output in due))
         return False
 
     def serve_request(self) -> bool:
@@ -291,6 +310,16 @@ class Replica:
             self._block[Block.ALIGNED] = was_aligned or held + 1
             return None
         self._block[Block.ALIGNED] = 0
+        if self._ballot is not None and is_complete:
+            # The messages of the active copy were fetched above.
+            theirs = (o.slots.record[SLOT_HEAD_SIZE:] for o in self._list_due(held))
+            active = self._group[Block.ACTIVE]
+            stray = self._ballot.find_stray(held, active, theirs)
+            if stray is not None and was_aligned:
+                self._group[Block.STRAYED] = stray + 1
+            if stray == active:
+                # The state of that copy is of no use.
+                return difference if was_aligned else None
         self._realign(held)
         return difference if was_aligned and is_complete else None
 

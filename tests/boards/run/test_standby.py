@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,15 +21,18 @@ from rack.backplane.words import Block, HandOver, System
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
-from tests.boards.conftest import PLANNED, UNJUDGED, MakeConfig
+from rack.boards.events import Event
+from tests.boards.conftest import PLAIN, PLANNED, UNJUDGED, MakeConfig
 from tests.boards.runs import end_of, faulty, kill
-from tests.processes import wait_until
+from tests.processes import BOUND_S, RACK, wait_until
 
 STANDBY = "board.wave.standby={slot=9,core=0}"
 TWO = "board.wave.standby=[{slot=9,core=0},{slot=10,core=1}]"
 SOON = "supervision.lockstep_restart_s=0.05"
 MANY = "supervision.restarts=1000"
 SECONDS = 0.5
+STRAYS_AT = 420
+LONG_S = 1.25
 MISSING = 1
 """Number of messages that a reader may miss in a hand-over in real time."""
 
@@ -218,3 +223,74 @@ def test_in_real_time_the_standby_of_the_clock_continues_its_grid(config: MakeCo
     around = ticks[(ticks >= 4) & (ticks <= 12)]
     assert np.diff(around).min() >= 1
     assert np.diff(around).max() <= 1 + 2
+
+
+def run_straying(
+    config: MakeConfig, file: Path, copy: str, *settings: str
+) -> tuple[ReplicatedTask, list[Event]]:
+    """Run a rack in which one copy computes wrong messages from `STRAYS_AT` on."""
+    text = PLAIN.replace("wave_levels:Wave", "wave_levels:Straying")
+    params = f'board.wave.params={{at={STRAYS_AT},strays="{file}"}}'
+    with Rack(config(params, SOON, UNJUDGED, *settings, text=text)) as rack:
+        file.write_text(str(rack.segment.get_block(copy)[Block.PID]))
+        rack.run(LONG_S)
+        (task,) = list_standbys(rack.segment)
+        return task, list(rack.events)
+
+
+@pytest.mark.parametrize("copy", ["wave", "wave.standby"])
+def test_copies_that_differ_are_noticed_one_cycle_later(
+    config: MakeConfig, tmp_path: Path, copy: str
+) -> None:
+    file = tmp_path / "pid"
+    task, events = run_straying(config, file, copy, STANDBY, "board.wave.compare=true")
+    (found,) = (event for event in events if event.code == "differs")
+    assert (found.tick, found.subject, found.board) == (
+        STRAYS_AT + 1,
+        "wave.status",
+        "wave.standby",
+    )
+    assert found.text == "'wave.status': a standby computes another value"
+    assert task.hand_overs == 0
+
+
+@pytest.mark.parametrize(
+    ("copy", "active", "reason"),
+    [
+        ("wave", "wave.standby", HandOver.STRAYED),
+        ("wave.standby", "wave", HandOver.NONE),
+        ("wave.standby2", "wave", HandOver.NONE),
+    ],
+)
+def test_the_copy_that_two_others_outvote_is_taken_out_and_restarted(
+    config: MakeConfig, tmp_path: Path, copy: str, active: str, reason: HandOver
+) -> None:
+    task, events = run_straying(config, tmp_path / "pid", copy, TWO, "board.wave.vote=true")
+    (found,) = (event for event in events if event.code == "strayed")
+    assert (found.tick, found.subject) == (STRAYS_AT + 2, copy)
+    assert (task.active.name, task.reason) == (active, reason)
+    (died,) = (event for event in events if event.code == "died")
+    (rejoined,) = (event for event in events if event.code == "rejoined")
+    assert (died.board, rejoined.board) == (copy, copy)
+    assert all(one.aligned_since is not None for one in task.copies if not one.is_active)
+
+
+def test_a_level_that_is_not_deterministic_cannot_be_compared(
+    config: MakeConfig, tmp_path: Path
+) -> None:
+    text = PLAIN.replace("wave_levels:Wave", "wave_levels:Lottery")
+    path = tmp_path / "lottery.toml"
+    path.write_text(config(STANDBY, "board.wave.compare=true", text=text).to_toml_text())
+    done = subprocess.run(
+        [*RACK, "run", str(path), "--seconds", "0.5", "--no-record"],
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S * 5,
+        check=False,
+    )
+    line = (
+        "board.wave.compare = true: the level is not deterministic: 'wave.status': a standby"
+        " computes another value, at the start"
+    )
+    assert (done.returncode, line in done.stderr) == (2, True), done.stderr
+    assert "Traceback" not in done.stderr
