@@ -137,6 +137,8 @@ class Replica:
         self.number = copies.index(spec)
         self.held_tick = -1
         self._late = self._quiet_until = -1
+        # Copies that begin with the run are equal from their first cycle on.
+        self._is_first = segment.words[System.STATE] == Run.STARTING
         self._alarms = alarms
         self._index = segment.layout.processes.index(spec)
         self._words = segment.words
@@ -196,8 +198,8 @@ class Replica:
         late = sum(block[Block.MISSED] + block[Block.SKIPPED] for block in self._blocks)
         if late != self._late:
             # A level may act differently in the cycle after a late one.
+            self._quiet_until = tick + 2 * self._every if self._late >= 0 else -1
             self._late = late
-            self._quiet_until = tick + 2 * self._every
         difference = self._compare(held)
         return None if tick <= self._quiet_until else difference
 
@@ -298,7 +300,8 @@ class Replica:
         Returns:
             The first difference, if there was none in the cycle before.
         """
-        was_aligned = self._block[Block.ALIGNED]
+        was_aligned = self._block[Block.ALIGNED] or self._is_first
+        self._is_first = False
         difference = None
         is_complete = True
         for output in self._list_due(held):
@@ -307,7 +310,7 @@ class Replica:
             elif difference is None and (field := output.find_difference()):
                 difference = FieldDifference(output.writer.spec.name, field)
         if is_complete and difference is None:
-            self._block[Block.ALIGNED] = was_aligned or held + 1
+            self._block[Block.ALIGNED] = self._block[Block.ALIGNED] or held + 1
             return None
         self._block[Block.ALIGNED] = 0
         if self._ballot is not None and is_complete:
