@@ -5,7 +5,7 @@ and writes the mailboxes. The others hold their messages back and compare them w
 active copy. `list_standbys` returns the state of all copies, for tools:
 
     for task in list_standbys(segment):
-        print(task.name, task.active.name, task.since_tick, task.reason.name)
+        print(task.name, task.active.name, task.since_tick, task.reason)
 
 The words of the hand-over are in the control block of the first copy, which has the name of the
 task. They change only while the changing process holds the kernel's lock on `Block.ACTIVE`. It ends
@@ -16,7 +16,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from rack.backplane.checked import to_enum
 from rack.backplane.segment import Segment
@@ -33,7 +33,8 @@ HAND_OVER_REASONS: Mapping[HandOver, str] = {
 """Reasons for hand-overs as text."""
 
 
-class Copy(NamedTuple):
+@dataclass(frozen=True)
+class Copy:
     """One copy of a task.
 
     Attributes:
@@ -56,42 +57,31 @@ class Copy(NamedTuple):
     aligned_since: int | None
 
 
-class ReplicatedTask(NamedTuple):
+@dataclass(frozen=True)
+class ReplicatedTask:
     """A task with standbys.
 
     Attributes:
         name: Name of the task.
         copies: Its copies, in their order.
         since_tick: Tick from which the active copy writes, 0 if no other did before.
-        reason: Why the active copy has taken over. NONE if no other was active before.
+        reason: Why the active copy has taken over: the name of a `HandOver` in lower case, "none"
+            if no other was active before.
         hand_overs: Number of hand-overs.
+        line: All of it as text.
     """
 
     name: str
     copies: tuple[Copy, ...]
     since_tick: int
-    reason: HandOver
+    reason: str
     hand_overs: int
+    line: str
 
     @property
     def active(self) -> Copy:
         """The copy that writes the mailboxes."""
         return next((copy for copy in self.copies if copy.is_active), self.copies[0])
-
-    @property
-    def line(self) -> str:
-        """Description in one line, for tools."""
-        active = self.active
-        others = [
-            f"'{copy.name}' "
-            + ("lost" if copy.is_lost else "differs" if copy.aligned_since is None else "ready")
-            for copy in self.copies
-            if copy is not active
-        ]
-        since = "the start"
-        if self.hand_overs:
-            since = f"tick {self.since_tick} ({HAND_OVER_REASONS[self.reason]})"
-        return f"'{self.name}': '{active.name}' active since {since}; {', '.join(others)}"
 
 
 def list_standbys(segment: Segment) -> tuple[ReplicatedTask, ...]:
@@ -121,10 +111,17 @@ def _read_task(segment: Segment, name: str) -> ReplicatedTask:
                 aligned if is_aligned else None,
             )
         )
-    return ReplicatedTask(
-        name,
-        tuple(copies),
-        words[Block.ACTIVE_SINCE],
-        to_enum(HandOver, words[Block.HAND_OVER]),
-        words[Block.HAND_OVERS],
-    )
+    reason = to_enum(HandOver, words[Block.HAND_OVER])
+    hand_overs = words[Block.HAND_OVERS]
+    since_tick = words[Block.ACTIVE_SINCE]
+    parts = [f"{copy.name} {_describe_copy(copy)}" for copy in copies]
+    since = f" since tick {since_tick}: {HAND_OVER_REASONS[reason]}" if hand_overs else ""
+    line = f"'{name}': {', '.join(parts)}{since}"
+    return ReplicatedTask(name, tuple(copies), since_tick, reason.name.lower(), hand_overs, line)
+
+
+def _describe_copy(copy: Copy) -> str:
+    """Return the state of a copy in one word."""
+    if copy.is_active:
+        return "active"
+    return "lost" if copy.is_lost else "differs" if copy.aligned_since is None else "ready"

@@ -24,7 +24,6 @@ from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DriveState, Sensed, find_arm, preload
 from rack.levels.arm.link import Link
-from rack.levels.arm.simulation import Simulation
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -165,7 +164,7 @@ class ArmDriver(Executor):
         reference = params.get("arm", ArmParams.model_fields["arm"].default)
         with suppress(ValueError):
             kind = find_arm(reference)
-            if not issubclass(kind, Simulation):
+            if not kind.is_simulated:
                 return f"arm {kind.__name__} is not a simulation, and one process must drive it"
         return super().find_standby_obstacle(params)
 

@@ -97,44 +97,6 @@ class TaskProgress:
 
 
 @dataclass(frozen=True)
-class StandbyRow:
-    """A task with standbys.
-
-    Attributes:
-        active: Name of the copy that writes.
-        pid: Its process.
-        since_tick: Tick from which it writes.
-        reason: Why it has taken over, in lower case. "none" if no other copy was active before.
-        hand_overs: Number of hand-overs.
-        ready: Copies whose messages equal those of the active one.
-        line: All of it as text.
-    """
-
-    task: str
-    active: str
-    pid: int
-    since_tick: int
-    reason: str
-    hand_overs: int
-    ready: tuple[str, ...]
-    line: str
-
-
-def build_standby_row(task: ReplicatedTask) -> StandbyRow:
-    """Return the row of a task with standbys."""
-    return StandbyRow(
-        task=task.name,
-        active=task.active.name,
-        pid=task.active.pid,
-        since_tick=task.since_tick,
-        reason=task.reason.name.lower(),
-        hand_overs=task.hand_overs,
-        ready=tuple(copy.name for copy in task.copies if copy.aligned_since is not None),
-        line=task.line,
-    )
-
-
-@dataclass(frozen=True)
 class Snapshot:
     """State of a rack at one moment.
 
@@ -175,7 +137,7 @@ class Snapshot:
     peers: tuple[PeerRow, ...]
     imports: tuple[ImportRow, ...]
     exports: tuple[ExportRow, ...]
-    standbys: tuple[StandbyRow, ...]
+    standbys: tuple[ReplicatedTask, ...]
 
 
 class RackMonitor:
@@ -235,7 +197,7 @@ class RackMonitor:
             peers=list_peers(self._newest),
             imports=list_imports(self._newest),
             exports=list_exports(self._newest),
-            standbys=tuple(map(build_standby_row, list_standbys(segment))),
+            standbys=list_standbys(segment),
             exchanges={
                 board: list_port_ages(message)
                 for board, message in self._list_messages(EXCHANGE_PORT)

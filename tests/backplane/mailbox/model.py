@@ -380,16 +380,15 @@ class _Model:
                     # A message takes the place of a forged one that was published.
                     epochs[serial] = (writer.epoch,)
                 return state._replace(slots=tuple(slots), epochs=tuple(epochs))
-        before = state.epochs[store.value] if store.value < len(state.epochs) else ()
+        epochs = [*state.epochs, ()][: max(len(state.epochs), store.value + 1)]
+        before = epochs[store.value]
         if is_lawful:
-            published = (*(one for one in before if one != writer.epoch), writer.epoch)
-            epochs = [*state.epochs[: store.value], published]
+            epochs[store.value] = (*(one for one in before if one != writer.epoch), writer.epoch)
         elif writer.is_stopped:
             # It sets the head back, or to the serial on which its successor works.
-            epochs = [*state.epochs, ()][: max(len(state.epochs), store.value + 1)]
             words = state.slots[store.value % self._setup.depth]
             if set(words) == {store.value * EPOCHS + state.claim}:
-                epochs[store.value] = (*epochs[store.value], state.claim)
+                epochs[store.value] = (*before, state.claim)
         else:
             raise Violation("a message is published without the valid claim")
         return state._replace(head=store.value, epochs=tuple(epochs))
