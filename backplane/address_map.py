@@ -16,7 +16,7 @@ CACHE_LINE = 64
 """Size of a cache line, in bytes. Blocks of different writers never share a cache line."""
 
 HEAD_SIZE = PAGE
-BLOCK_SIZE = 5 * CACHE_LINE
+BLOCK_SIZE = 6 * CACHE_LINE
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 192
 ALARM_DEPTH = 256
@@ -33,6 +33,8 @@ CLOCK = "clock"
 
 Its window holds the fault table, the operator table and the operators' mailboxes.
 """
+CLOCK_STANDBY = "clock.standby"
+"""Name of the process that continues the clock when the first one is lost."""
 MAILBOX_HEAD_SIZE = 2 * CACHE_LINE
 SLOT_HEAD_SIZE = 64
 SCRATCH_SIZE = CACHE_LINE

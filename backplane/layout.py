@@ -19,8 +19,12 @@ Protocol = Literal[Sampled, "queue"]
 TICK_PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
-Role = Literal["executor", "planner", "host"]
-"""Kind of task. "host" stands for a host board, which has no rate and is not released."""
+Role = Literal["executor", "planner", "standby", "host"]
+"""Kind of task.
+
+"standby" stands for a further copy of an executor. "host" stands for a host board, which has no
+rate and is not released.
+"""
 
 KIND_PATTERN = re.compile(r"[<>|]?[biufcSUV]\d+")
 """Pattern of numpy type strings that a field may have.
@@ -197,7 +201,8 @@ class TaskSpec:
     """A schedulable task: the executor or the planner of a board, or a host board.
 
     Attributes:
-        name: "servo" for an executor, "servo.planner" for its planner.
+        name: "servo" for an executor, "servo.planner" for its planner, "servo.standby" for its
+            standby, "servo.standby2" for a second one.
         board: Name of the board.
         role: Kind of task.
         slot: VME slot of the board.
@@ -269,9 +274,30 @@ class Layout:
 
     @property
     def timed(self) -> tuple[MailboxSpec, ...]:
-        """All mailboxes except those written by host boards, which may write at any time."""
+        """All mailboxes except those written by host boards, which may write at any time.
+
+        Also except mailboxes through which the clock is asked to switch to a standby, and which no
+        level reads. A rack with standbys thus has the same digest as without them.
+        """
         hosts = {host.name for host in self.hosts}
-        return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
+        tasks = {task.name for task in self.tasks}
+        replicated = {task.board for task in self.tasks if task.role == "standby"}
+        return tuple(
+            mailbox
+            for mailbox in self.mailboxes
+            if mailbox.writer not in hosts
+            and (
+                mailbox.readers
+                or mailbox.writer in tasks
+                or mailbox.name.partition(".")[0] not in replicated
+            )
+        )
+
+    def list_copies(self, task: str) -> tuple[TaskSpec, ...]:
+        """Return a task, followed by its standbys in their order."""
+        spec = self.find_task(task)
+        standbys = (s for s in self.tasks if s.role == "standby" and s.board == spec.name)
+        return (spec, *standbys)
 
     def find_pacers(self, host: TaskSpec) -> set[str]:
         """Return the bus adapters that share a mailbox with a host board.

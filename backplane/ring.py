@@ -74,5 +74,6 @@ class Ring:
         # The writer may have overwritten the oldest rows during the copy.
         torn = max(0, compute_oldest_intact(self._written_count, self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
-        self._taken = head
+        # The head of a mailbox is set back if a stopped writer continues after a hand-over.
+        self._taken = max(self._taken, head)
         return NewRows(rows[torn:], lost)

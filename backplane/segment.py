@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rack.backplane.message import Message
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 18
+VERSION = 19
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words that contain the addresses of the texts. The word after each contains the size."""
 PREFIX = "nasrem-rack."
@@ -320,6 +320,14 @@ class Segment:
         """
         start = self.map.blocks[task] // 8
         return self.words[start : start + BLOCK_SIZE // 8]
+
+    def get_copy_blocks(self, task: str) -> list[memoryview]:
+        """Return the control blocks of all copies of a task, which are several if it has standbys.
+
+        Raises:
+            KeyError: There is no such task.
+        """
+        return [self.get_block(copy.name) for copy in self.layout.list_copies(task)]
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task up to `tick`.

@@ -193,6 +193,25 @@ class Block:
     # In lockstep, processor time in ns of the cycle that waits for the end of its job on a
     # simulated core.
     COMPUTING_NS = 33
+    # Of a task with standbys, written by the copy that takes over: see `rack.backplane.standby`.
+    # Number of the active copy, 0 for the task itself.
+    ACTIVE = 34
+    ACTIVE_SINCE = 35  # tick from which that copy writes
+    HAND_OVER = 36  # HandOver, the reason for the last hand-over
+    HAND_OVERS = 37  # number of hand-overs
+    # 1 + number of the copy that must take over, 0 for none; with the reason in TAKE_OVER_REASON.
+    # Written by the clock and cleared by that copy.
+    TAKE_OVER = 38
+    TAKE_OVER_REASON = 39
+    # Of each copy: 1 + tick since which its outputs equal those of the active copy, 0 while they
+    # differ. Written by the copy.
+    ALIGNED = 40
+    # Of each copy in a vote: 1 + tick of a cycle and checksum of its messages, then the same of the
+    # next or the previous cycle. Written by the copy.
+    BALLOT = 41
+    # Of a task with standbys: 1 + number of the copy that has strayed, 0 for none. Written by the
+    # copy that has found it, and cleared by the clock.
+    STRAYED = 45
 
 
 class TaskState(IntEnum):
@@ -205,6 +224,17 @@ class TaskState(IntEnum):
     ENDED = 4
     FAILED = 5
     GIVEN_UP = 6  # lost, and not to be restarted; written by the Rack
+
+
+class HandOver(IntEnum):
+    """Values of `Block.HAND_OVER`: why a copy of a task has taken over its mailboxes."""
+
+    NONE = 0
+    LOST = 1  # the process of the active copy has ended, or was found hanging
+    STOPPED = 2  # a signal has stopped that process
+    LATE = 3  # the active copy had not finished its cycle at its next release
+    COMMANDED = 4  # an operator has switched
+    STRAYED = 5  # two of three copies agree, and the active one differs
 
 
 class Scheduler(IntEnum):
@@ -257,6 +287,10 @@ class Box:
     # Of a queue: serial of the newest message taken, times 3. See `queue.QueueReader`.
     POSITION = 11
     FIRST = 12  # serial of the newest message before this run, see `Block.TRACE_FIRST`
+    # This word and the two after it: serial of the newest message when an epoch began, of epoch e
+    # in word BEGUN + e % EPOCHS. A message of an earlier epoch has no greater serial.
+    BEGUN = 13
+    EPOCHS = 3
 
 
 class Slot:

@@ -129,6 +129,8 @@ class TaskWiring:
             there are any, the task writes its mailbox `<board>.exchange`.
         scheduling: How the task competes for its core. None for a fixed priority that stays.
         budget_ns: Budgeted processor time of a cycle or plan. 0 without a budget.
+        compares: True if a standby raises an alarm when its messages differ.
+        votes: True if the copy that differs from the two others is taken out.
     """
 
     task: str
@@ -145,6 +147,8 @@ class TaskWiring:
     exchange: Mapping[str, ExchangeSpec]
     scheduling: Scheduling | None
     budget_ns: int
+    compares: bool
+    votes: bool
 
 
 @dataclass(frozen=True)
@@ -194,6 +198,7 @@ class ClockWiring:
         reservation: Processor time to reserve instead of a priority, None for none.
         schedulings: How executors compete for their cores, by task. Empty if the config names no
             scheduler.
+        copy: Number of this process among those that can run the clock, None if it is the only one.
     """
 
     lockstep: bool
@@ -211,3 +216,4 @@ class ClockWiring:
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
     schedulings: Mapping[str, Scheduling]
+    copy: int | None

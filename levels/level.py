@@ -528,6 +528,24 @@ class Executor(LevelSection, ABC):
         """
         return ConfiguredPorts()
 
+    @classmethod
+    def find_standby_obstacle(cls, params: Mapping[str, Any]) -> str:
+        """Return why the level cannot have a standby. Empty if it can.
+
+        Called before the launch. A level that drives an arm or a hand needs an output `state`, from
+        which the simulation of a standby is realigned. `params` may be invalid.
+        """
+        if cls.faults and "state" not in cls.outputs:
+            return f"class {cls.__name__} has no output 'state', from which a standby is realigned"
+        return ""
+
+    def realign(self, state: Message) -> None:
+        """Continue from `state`, the message that the active copy has written in its last cycle.
+
+        Called in a standby before a cycle, after it or the active copy has missed one. By default,
+        do nothing, which suits a level whose messages follow from its inputs.
+        """
+
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults. `faults` contains all faults that are now active."""
 

@@ -47,6 +47,7 @@ class Operation(IntEnum):
     RELEASE = 11  # end the bring-up and permit full speed
     SET = 12  # set a live parameter of the level; `name` is key=value
     SCHEDULE = 13  # change the scheduler of the level's board, which does this, to `name`
+    SWITCH = 14  # hand over to a standby, which the clock does
 
 
 class Goal(IntEnum):
@@ -66,8 +67,12 @@ SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET, Operation.SCHEDULE
 
 Each gives the name of what it sets.
 """
+CLOCK_OPERATIONS = (Operation.SCHEDULE, Operation.SWITCH)
+"""Operations on the board of the level, which the clock carries out."""
 DRIVE_OPERATIONS = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)
 """Operations on the arm itself, which do not replace the command in force either."""
+PASSING_OPERATIONS = (*SETTINGS, *CLOCK_OPERATIONS, *DRIVE_OPERATIONS)
+"""All operations that do not replace the command in force."""
 NAMED_OPERATIONS = (*SETTINGS, Operation.DO)
 """Operations that give a name: see `Executor.list_operation_names`."""
 
@@ -240,8 +245,8 @@ class Orders:
         for message in (*operator.earlier, operator.message):
             replaced = self.in_force
             if self._accept_command(message):
-                taken = taken or message.what not in (*SETTINGS, *DRIVE_OPERATIONS)
-                if judge is not None and message.what != Operation.SCHEDULE:
+                taken = taken or message.what not in PASSING_OPERATIONS
+                if judge is not None and message.what not in CLOCK_OPERATIONS:
                     judge(message)
             if self.in_force != replaced:
                 self._news = [answer for answer in self._news if answer.serial != replaced]
@@ -256,8 +261,7 @@ class Orders:
         self.serial = message.id
         operation = message.what
         goal = message.goal
-        # The board, not the level, changes its scheduler.
-        known = {**self._commands, Operation.SCHEDULE: ()}
+        known = {**self._commands, **dict.fromkeys(CLOCK_OPERATIONS, ())}
         if operation not in known or goal not in (known[Operation(operation)] or (Goal.NONE,)):
             self.refuse_newest(
                 f"{describe_command(operation, goal)} is not a command of this level; permitted:"
@@ -265,9 +269,14 @@ class Orders:
             )
             return False
         self.basis = self.serial
-        is_done = operation in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
+        is_done = operation in (
+            Operation.RESUME,
+            Operation.RELEASE,
+            *CLOCK_OPERATIONS,
+            *SETTINGS,
+        )
         answer = _CommandAnswer(self.serial, Answer.DONE if is_done else Answer.TAKEN)
-        if operation not in (*SETTINGS, *DRIVE_OPERATIONS):
+        if operation not in PASSING_OPERATIONS:
             self.standing = (
                 Operation.NONE if operation == Operation.RESUME else Operation(operation)
             )

@@ -68,7 +68,7 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
-            ("boards/run/compiled_mailbox.py", " != received.check:", " is None:"),
+            ("boards/run/compiled_mailbox.py", " != check:", " is None:"),
             (f"{WATCH}/message_watch.py", "self._record_finding(Alarm.DAMAGED, tick)", "pass"),
             (f"{WATCH}/watched_reader.py", DAMAGED, "pass"),
         ),

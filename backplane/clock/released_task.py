@@ -202,7 +202,7 @@ class Watchdog:
         missed = task.missed
         spec = task.spec
         if missed == 1:
-            late = Alarm.LATE if spec.role == "executor" else Alarm.PLAN_LATE
+            late = Alarm.PLAN_LATE if spec.role == "planner" else Alarm.LATE
             self._alarms.raise_alarm(tick, late, task.index, missed, task.block[Block.DONE])
         if missed < RELEASES_MISSED:
             return

@@ -96,6 +96,8 @@ class NextCycle:
         self.skipped = 0
         self.copy: Callable[[], None] | None = None
         """Function called between two cycles to fork a copy of the task for a snapshot."""
+        self.serve_request: Callable[[], None] | None = None
+        """Function called before each wait in a copy of a task, which may have to take over."""
 
     def wait(self) -> int | None:
         """Wait for the task's next release, take it, and set `skipped`.
@@ -127,6 +129,8 @@ class NextCycle:
                 return self._take_release(newest)
             if block[Block.COPY] > 0 and self.copy is not None:
                 self.copy()
+            if self.serve_request is not None:
+                self.serve_request()
             if is_over or not self._pause():
                 return None
             is_posted = False

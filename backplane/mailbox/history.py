@@ -65,7 +65,12 @@ class MailboxRing(Ring):
         serials = np.arange(self._taken - len(rows), self._taken) + 1
         holder = self._box[Box.CLAIMANT]
         signatures = rows["epoch"]
-        lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < get_epoch(holder))
+        epochs = signatures & EPOCH_MASK
+        newest = get_epoch(holder)
+        # As in `Slots.is_from_claimant`.
+        following = np.maximum(epochs + 1, newest - Box.EPOCHS + 1) % Box.EPOCHS
+        begun = np.array(self._box[Box.BEGUN : Box.BEGUN + Box.EPOCHS])
+        lawful = (signatures == holder) | ((epochs < newest) & (serials <= begun[following]))
         if not lawful[-1]:
             # The newest message is forged. The true writer will overwrite it with its next message,
             # which has the same serial, so read this row again at the next call.
@@ -77,7 +82,7 @@ class MailboxRing(Ring):
         )
         good = (
             lawful
-            & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"])
+            & (np.fromiter(checks, np.uint64, len(rows)) == rows["check"] ^ epochs.astype("u8"))
             & (rows["serial"] == serials)
         )
         if not good.all():

@@ -85,7 +85,17 @@ class Writer:
     message, in a new epoch.
     """
 
-    def __init__(self, segment: Segment, name: str) -> None:
+    def __init__(self, segment: Segment, name: str, is_held: bool = False) -> None:
+        """Open a mailbox for writing.
+
+        Args:
+            segment: Memory of the rack.
+            name: Name of the mailbox.
+            is_held: True for a standby, which claims the mailbox only when it takes over.
+
+        Raises:
+            MailboxError: The mailbox has another writer.
+        """
         self.spec = spec = segment.layout.find_mailbox(name)
         self.slots = Slots(segment, spec)
         self._delay = spec.delay
@@ -106,26 +116,83 @@ class Writer:
         # The claim is in the segment, even if the slots publish to another head.
         self._claimed = segment.get_box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
-        self.claim_mailbox()
-        self.slots.clear_unpublished()
-        self.slots.resume_writing(self.slots.signature)
+        self.has_claim = False
+        self.is_locked = False
+        """True if this process holds the kernel's lock on the claim.
+
+        A standby that takes over from a stopped process gets it only when that process has ended.
+        """
+        if not is_held:
+            self._continue_after(self.claim_mailbox())
         _WRITERS.add(self)
 
-    def claim_mailbox(self) -> None:
+    def claim_mailbox(self) -> int:
         """Claim the mailbox in a new epoch.
+
+        Returns:
+            Serial of the newest message of the previous writer.
 
         Raises:
             MailboxError: The mailbox has another writer.
         """
-        box = self._claimed
-        if not self._claim.take():
-            pid = box[Box.WRITER_PID]
+        if not self.try_lock():
+            pid = self._claimed[Box.WRITER_PID]
             self._claim.close()
             raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
+        return self._begin_epoch()
+
+    def take_over(self) -> None:
+        """Claim the mailbox in a new epoch, even if the process of its writer is alive.
+
+        Readers reject what that process publishes from now on. Only a standby may call this, while
+        it holds the lock on the hand-over: see `rack.backplane.standby`.
+        """
+        self.try_lock()
+        self._continue_after(self._begin_epoch())
+
+    @property
+    def holds_claim(self) -> bool:
+        """True if no other process has claimed the mailbox since this one did."""
+        return self.has_claim and self._claimed[Box.CLAIMANT] == self.slots.signature
+
+    def try_lock(self) -> bool:
+        """Take the kernel's lock on the claim, unless another process holds it."""
+        self.is_locked = self.is_locked or self._claim.take()
+        return self.is_locked
+
+    def release_claim(self) -> None:
+        """Stop writing, because a standby has taken over the mailbox."""
+        self.has_claim = self.is_locked = False
+        self._claim.release()
+
+    def _begin_epoch(self) -> int:
+        """Enter this process in the head of the mailbox as its writer.
+
+        Returns:
+            Serial of the newest message of the previous writer.
+        """
+        box = self._claimed
+        epoch = get_epoch(box[Box.EPOCH] + 1)
+        # A previous writer that was stopped may store this word again at any time, so load it once.
+        head = box[Box.HEAD]
+        box[Box.BEGUN + epoch % Box.EPOCHS] = head
+        # A reader that finds the new claim must find the word that belongs to it.
+        self.slots.fence()
         box[Box.WRITER_PID] = os.getpid()
-        box[Box.EPOCH] = epoch = get_epoch(box[Box.EPOCH] + 1)
+        box[Box.EPOCH] = epoch
         # Epoch and process are stored in one word, so that no reader sees half a claim.
-        box[Box.CLAIMANT] = self.slots.signature = build_signature(epoch, os.getpid())
+        box[Box.CLAIMANT] = signature = build_signature(epoch, os.getpid())
+        # The word of the checksum depends on the signature: see `Slots.chain`.
+        chain = self.slots.chain
+        self.slots.signature = signature
+        self.slots.chain = chain
+        self.has_claim = True
+        return head
+
+    def _continue_after(self, head: int) -> None:
+        """Continue after the newest message of the previous writer, which has this serial."""
+        self.slots.clear_unpublished(head)
+        self.slots.resume_writing(self.slots.signature, head)
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`.
@@ -218,7 +285,9 @@ _WRITERS: WeakSet[Writer] = WeakSet()
 def reclaim_mailboxes() -> None:
     """Claim all mailboxes of this process again, after it was switched to another segment."""
     for writer in _WRITERS:
-        writer.claim_mailbox()
+        if writer.has_claim:
+            writer.is_locked = False
+            writer.claim_mailbox()
 
 
 @dataclass(slots=True)
@@ -297,7 +366,7 @@ class Reader:
         self.accesses += 1
         slots = self.slots
         serial = slots.box[0]
-        if serial != self.serial:
+        if serial > self.serial:
             slots.fence()
             # Older messages are overwritten. If no slot has a visible message, fetching the serial
             # at which the loop ends will fail.
@@ -313,12 +382,13 @@ class Reader:
         the result is the last good message with verdict BUS_ERROR.
 
         Args:
-            serial: Serial of the message found by the read. If it is the serial of the last good
-                message, this message is returned again with verdict OLD or NONE.
+            serial: Serial of the message found by the read. If it is not greater than the serial of
+                the last good message, this message is returned again with verdict OLD or NONE. It
+                may be smaller after a writer that had been stopped has stored the mailbox's head.
             tick: Release tick of the cycle that reads.
         """
         self.found = serial
-        if serial == self.serial:
+        if serial <= self.serial:
             return self._unchanged
         if self._fetch_good(serial):
             return self._new
@@ -338,7 +408,7 @@ class Reader:
         slots = self.slots
         if not slots.fetch_message(serial):
             return False
-        if slots.signature != self._signature:
+        if not slots.signature == self._signature == slots.box[Box.CLAIMANT]:
             if not slots.is_from_claimant(self._signature):
                 return False
             self._unchanged = self._readings[Verdict.OLD]

@@ -162,6 +162,14 @@ def open_writer(segment: Segment, name: str) -> Writer:
     return WRITERS[segment.layout.find_mailbox(name).protocol](segment, name)
 
 
+def open_standby_writer(segment: Segment, name: str) -> Writer:
+    """Open a mailbox under protocol time-slice or double-buffer, without claiming it."""
+    kind = Writer
+    if segment.layout.find_mailbox(name).protocol == "double-buffer":
+        kind = DoubleBufferWriter
+    return kind(segment, name, is_held=True)
+
+
 def open_reader(
     segment: Segment, name: str, asynchronous: bool = False, inbox: BoardInbox | None = None
 ) -> Reader:

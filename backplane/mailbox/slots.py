@@ -115,12 +115,10 @@ class Slots:
     """
 
     # Words of the local record: time of publication (CLOCK_MONOTONIC), signature of the writer
-    # (see `build_signature`), checksum over this and every earlier message of the mailbox, serial
-    # (0 without a message), release tick of the writing cycle, and tick from which the message is
-    # visible.
+    # (see `build_signature`), serial (0 without a message), release tick of the writing cycle, and
+    # tick from which the message is visible.
     stamp_ns = Word(Slot.STAMP_NS)
     signature = Word(Slot.EPOCH)
-    chain = Word(Slot.CHECK)
     serial = Word(Slot.SERIAL)
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)
@@ -146,6 +144,20 @@ class Slots:
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
 
+    @property
+    def chain(self) -> int:
+        """Checksum over the message in the local record and every earlier message of the mailbox.
+
+        The word in the record is the checksum combined with the epoch of the writer's claim. After
+        a standby has taken over, the message of one writer with the signature of the other fails
+        the check, whereas the checksum itself is the same in equal runs.
+        """
+        return self.words[_CHECK] ^ (self.words[_EPOCH] & EPOCH_MASK)
+
+    @chain.setter
+    def chain(self, value: int) -> None:
+        self.words[_CHECK] = value ^ (self.words[_EPOCH] & EPOCH_MASK)
+
     @staticmethod
     def fence() -> None:
         """Prevent memory accesses from being reordered across this call.
@@ -154,29 +166,34 @@ class Slots:
         memory fence.
         """
 
-    def resume_writing(self, signature: int) -> None:
+    def resume_writing(self, signature: int, head: int) -> None:
         """Set the local record so that a writer continues after the newest published message.
 
         Args:
             signature: Signature of the writer.
+            head: Serial of the newest message.
         """
         # Ignore the sign, so that a flipped sign bit does not make a writer fail.
-        self.serial = head = self.box[Box.HEAD] & (UNSIGNED >> 1)
+        self.serial = head = head & (UNSIGNED >> 1)
         self.signature = signature
         # The newest serial may have no message. The chain of checksums continues from the newest
         # message that is in its slot.
         self.chain = 0
         for serial in range(head, max(0, head - self.depth - 1), -1):
             if self.has_message(serial):
-                self.chain = self.heads[serial & self.mask][_CHECK] & UNSIGNED
+                words = self.heads[serial & self.mask]
+                self.chain = (words[_CHECK] & UNSIGNED) ^ (words[_EPOCH] & EPOCH_MASK)
                 break
 
-    def clear_unpublished(self) -> None:
+    def clear_unpublished(self, head: int) -> None:
         """Clear the serials of slots that a dead writer has filled but not published.
 
         Otherwise readers could mistake them for lost messages of the new writer.
+
+        Args:
+            head: Serial of the newest message.
         """
-        head = self.box[Box.HEAD] & (UNSIGNED >> 1)
+        head &= UNSIGNED >> 1
         for words in self.heads:
             if words[_SERIAL] > head:
                 words[_SERIAL] = 0
@@ -205,8 +222,9 @@ class Slots:
         at = serial & self.mask
         intruder = 0 if box[0] == before else self.heads[at][_EPOCH] >> EPOCH_BITS
         _PUT_CONTENT(self.record, CHECKED_FROM, basis, serial, tick, visible_at)
-        words[_CHAIN] = chain = words[_CHECK]
-        words[_CHECK] = xxh3(self.covered, chain)
+        epoch = words[_EPOCH] & EPOCH_MASK
+        words[_CHAIN] = chain = words[_CHECK] ^ epoch
+        words[_CHECK] = xxh3(self.covered, chain) ^ epoch
         words[_STAMP] = monotonic_ns()
         # The order of stores is: the previous head, the message, its signature, this head.
         self.fence()
@@ -276,12 +294,23 @@ class Slots:
     def is_from_claimant(self, known: int) -> bool:
         """Check whether the writer of the local message held the claim on the mailbox.
 
+        A message of an earlier writer was published before the next epoch began. A writer that was
+        stopped, and whose mailbox a standby has taken over, may store one more message. Its serial
+        is greater.
+
         Args:
             known: Signature of the last message accepted by the caller, 0 for none. Messages from
                 earlier epochs than this one are rejected.
         """
         signature = self.signature
         holder = self.box[Box.CLAIMANT]
-        return signature in (known, holder) or get_epoch(known) < get_epoch(signature) < get_epoch(
-            holder
-        )
+        if signature == holder:
+            return True
+        self.fence()
+        epoch = get_epoch(signature)
+        newest = get_epoch(holder)
+        if signature != known and not get_epoch(known) < epoch < newest:
+            return False
+        # Epochs that began too long ago have no word any more. The oldest word is a bound for them.
+        following = max(epoch + 1, newest - Box.EPOCHS + 1)
+        return epoch < newest and self.serial <= self.box[Box.BEGUN + following % Box.EPOCHS]

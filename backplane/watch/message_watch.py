@@ -14,11 +14,11 @@ from xxhash import xxh3_64_intdigest as xxh3
 from rack.backplane.address_map import compute_oldest_intact
 from rack.backplane.mailbox.mailbox import CHECKED_SERIAL, CHECKED_TICK, Reader
 from rack.backplane.mailbox.queue import QueueReader
-from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
+from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED, get_epoch
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
-from rack.backplane.words import Slot, Word
+from rack.backplane.words import Block, Slot, Word
 
 LONG_AGO = -(1 << 62)
 """Release tick assumed for the message before the first one."""
@@ -46,12 +46,24 @@ class MessageWatch:
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots
-        self._cycles = CycleRecord(segment, reader.spec.writer)
+        copies = segment.layout.list_copies(reader.spec.writer)
+        self._records = [CycleRecord(segment, copy.name) for copy in copies]
+        self._blocks = [segment.get_block(copy.name) for copy in copies]
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_tick_based
         # A message that is visible at once carries the tick at which it was written.
         self.late_from = self._spec.delay + self._is_sliced
         self._held_up = 0
+
+    @property
+    def _active(self) -> int:
+        """Number of the copy that writes, if the writer has standbys. 0 otherwise."""
+        return self._blocks[0][Block.ACTIVE] % len(self._blocks)
+
+    @property
+    def _cycles(self) -> CycleRecord:
+        """Record of the writer's cycles."""
+        return self._records[self._active]
 
     def check_messages(self, tick: int) -> None:
         """Check the messages that have become visible up to the read at `tick`."""
@@ -128,7 +140,7 @@ class MessageWatch:
                 and (
                     serial == taken
                     or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
-                    == head[Slot.CHECK] & UNSIGNED
+                    == (head[Slot.CHECK] & UNSIGNED) ^ get_epoch(head[Slot.EPOCH])
                 )
                 and slots.is_intact(serial)
             ):

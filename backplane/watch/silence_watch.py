@@ -83,7 +83,7 @@ class SilenceWatch(MessageWatch):
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._task = task
-        self.block = segment.get_block(spec.writer)
+        self.block = self._blocks[0]
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
@@ -103,7 +103,8 @@ class SilenceWatch(MessageWatch):
             # If the writer is already marked as lost, `pid` may be its new process, which is alive
             # but has not written yet.
             if age >= self._stale_after and (
-                self.block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
+                self._blocks[self._active][Block.LOST]
+                or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
                 self._report_silence(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
@@ -119,7 +120,9 @@ class SilenceWatch(MessageWatch):
         """
         # A loss takes effect one tick after it was found. In the same tick, the result would depend
         # on which process is faster.
-        return self._reader.newest != NO_MESSAGE_TICK and 0 < self.block[Block.LOST] <= tick
+        if not 0 < self.block[Block.LOST] <= tick or self._reader.newest == NO_MESSAGE_TICK:
+            return False
+        return all(0 < block[Block.LOST] <= tick for block in self._blocks)
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a cycle without writing the message due in it."""

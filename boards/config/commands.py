@@ -15,11 +15,12 @@ from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.operator_table import Request
 from rack.backplane.words import Scheduler
 from rack.boards.config.cell import build_rack_cell
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.connections import find_executors
 from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schedulers import list_reservation_mistakes, list_valid_schedulers
-from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import compute_first_tick
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm

@@ -264,7 +264,11 @@ class Wiring:
         """Mailboxes through which an operator commands levels."""
         classes = find_executors(self.config).items()
         is_any = names_scheduler(self.config)
-        return [f"{board}.operator" for board, kind in classes if is_any or has_operator_port(kind)]
+        return [
+            f"{board}.operator"
+            for board, kind in classes
+            if is_any or has_operator_port(kind) or self.config.board[board].standby
+        ]
 
     @cached_property
     def types(self) -> dict[str, MessageType]:

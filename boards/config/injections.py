@@ -83,8 +83,12 @@ class FaultCheck:
                     key, f"{given_keys[0]} is also given; give only one of {', '.join(keys)}"
                 )
         fault = self.fault
-        places = (*self.config.list_tasks(), *self.config.list_hosts())
-        tasks: dict[str, Role] = {place.name: place.role for place in places}
+        config = self.config
+        tasks: dict[str, Role] = {
+            **{place.name: place.role for place in (*config.list_tasks(), *config.list_hosts())},
+            # Whatever strikes an executor strikes its standbys too.
+            **{place.name: "executor" for place in config.list_standbys()},
+        }
         kind = KINDS.names.get(fault.kind)
         if kind is None:
             yield self._build_mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")

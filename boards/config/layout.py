@@ -110,7 +110,20 @@ class LayoutBuilder:
             self._build_mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
             for name in self._wiring.operator_mailboxes
         ]
-        specs = self._tasks.values()
+        # Standbys follow all other tasks, whose indices therefore do not depend on them.
+        standbys = [
+            replace(
+                self._tasks[place.board],
+                name=place.name,
+                role=place.role,
+                slot=place.slot,
+                core=find_core(place.core),
+                priority=place.priority,
+            )
+            for place in self._config.list_standbys()
+            if place.board in self._tasks
+        ]
+        specs = (*self._tasks.values(), *standbys)
         return Layout(
             rack=self._config.name,
             clock_ns=self._config.clock_ns,

@@ -14,10 +14,11 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.files import CONFIGS, Assembled, assemble, resolve_paths
 from rack.boards.config.mistakes import convert_errors
 from rack.boards.config.resolved import Examination
-from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
+from rack.boards.config.schema import LAST_SLOT, RackConfig
 from rack.boards.config.toml import Tables, find_table_name, parse_tables, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig

@@ -139,6 +139,8 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
     if names_scheduler(config):
         commands[Operation.SCHEDULE] = ()
         wording[Operation.SCHEDULE] = list_valid_schedulers(config)
+    if config.board[board].standby:
+        commands[Operation.SWITCH] = ()
     for what in commands.keys() & {*NAMED_OPERATIONS} - wording.keys():
         # A state table may be invalid while it is being edited.
         with suppress(LevelError):

@@ -10,11 +10,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+from rack.backplane.address_map import CLOCK_STANDBY
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
 from rack.backplane.words import Demand
 from rack.boards.config.cell import compute_cell_sizes
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.commands import build_requests, find_command_mistakes
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.injections import build_injections, find_fault_mistakes, list_faults
@@ -23,7 +25,7 @@ from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
 from rack.boards.config.schedulers import build_scheduling, compute_clock_reservation
-from rack.boards.config.schema import LAN, CommandConfig, RackConfig
+from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.sending import settle_sending
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
@@ -162,9 +164,23 @@ class Resolved:
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
             schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
+            copy=None if clock.standby is None else 0,
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
+
+    def build_clock_standbys(self, wiring: ClockWiring) -> Mapping[str, ClockWiring]:
+        """Return the wiring of the clock's standby by its name. Empty if the clock has none.
+
+        Args:
+            wiring: Wiring of the clock.
+        """
+        standby = self.config.clock.standby
+        if standby is None:
+            return {}
+        priority = wiring.priority if standby.priority is None else standby.priority
+        core = find_core(standby.core)
+        return {CLOCK_STANDBY: replace(wiring, core=core, priority=priority, copy=1)}
 
     def _to_ticks(self, seconds: float) -> int:
         """Convert simulated time in s to ticks."""
@@ -259,6 +275,16 @@ class Examination:
             self._build_task_wiring(layout, ports, ports.task in failing)
             for ports in self._wiring.tasks
         )
+        wirings = {task.task: task for task in tasks}
+        tasks += tuple(
+            replace(
+                wirings[place.board],
+                task=place.name,
+                guards_clock=False,
+                fails_self_test=place.name in failing,
+            )
+            for place in config.list_standbys()
+        )
         hosts = tuple(
             HostWiring(
                 board=(name := ports.place.board),
@@ -315,6 +341,8 @@ class Examination:
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
             scheduling=scheduling,
+            compares=is_executor and board.compare,
+            votes=is_executor and board.vote,
             budget_ns=(scheduling.cost_ns if scheduling else 0) or budget_ns,
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}

@@ -16,22 +16,18 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
-from rack.levels.operator import MAX_NAME_BYTES, Goal, Operation
 from rack.levels.tables import (
-    Finite,
-    Moment,
     Positive,
     RobotConfig,
     SceneConfig,
     Table,
-    Tick,
-    Vector,
 )
 
 CLOCK_SLOT = 1
@@ -54,8 +50,14 @@ def _to_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _to_list(value: Any) -> Any:
+    """Convert a single table or a list of tables to a tuple. Return other values unchanged."""
+    return (value,) if isinstance(value, Mapping) else _to_tuple(value)
+
+
 RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
+Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(_to_list)]
 Neighbours = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
 Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_to_tuple)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
@@ -79,6 +81,20 @@ LONGEST_EVERY = 1_000_000
 
 
 SchedulerName = Literal["fixed-priority", "earliest-deadline-first", "maximum-urgency-first"]
+
+
+class StandbyConfig(Table):
+    """`[board.<name>] standby`, `[clock] standby`: place of a further copy.
+
+    See `rack.backplane.standby`.
+    """
+
+    slot: Slot
+    """slot in the crate"""
+    core: Core = 0
+    """core of the copy; this machine must have it"""
+    priority: Priority | None = None
+    """SCHED_FIFO priority of the copy; default: the board's"""
 
 
 class ClockConfig(Table):
@@ -108,6 +124,8 @@ class ClockConfig(Table):
     """core of the system controller"""
     priority: Priority = 0
     """SCHED_FIFO priority of the system controller; 0 means ordinary scheduling"""
+    standby: StandbyConfig | None = None
+    """further process that continues the clock when the first one is lost"""
 
 
 class TimingConfig(Table):
@@ -268,6 +286,13 @@ class BoardConfig(PlacedConfig):
     """maximum-urgency-first runs critical boards before others"""
     transfer: TransferConfig = TransferConfig()
     """emulation of a slower bus for this board"""
+    standby: Standbys = ()
+    """further copy of the executor, which takes over its mailboxes when it is lost, or a list"""
+    compare: bool = False
+    """raise an alarm, one cycle later, when a standby computes other messages; the level must be
+    deterministic"""
+    vote: bool = False
+    """with two standbys: the copy that differs from the two others is taken out and restarted"""
     ends_run: bool = False
     """end the run when this level's status is done or error"""
     on_loss: OnLoss = "hold"
@@ -344,73 +369,13 @@ class HostConfig(Table):
     """overrides supervision.within_s for this board [s]"""
 
 
-class CommandConfig(Table):
-    """`[[command]]`: an operator command to a level."""
-
-    level: str
-    """board of the commanded level, such as servo or task"""
-    what: Literal[
-        "hold",
-        "resume",
-        "setpoint",
-        "goto",
-        "modify",
-        "table",
-        "do",
-        "set",
-        "schedule",
-        "enable",
-        "disable",
-        "reset",
-        "release",
-    ]
-    """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
-    add or remove a control modification; table: switch to another state table; do: carry out one of
-    the level's own commands; set: change a live parameter of the level; schedule: change the
-    scheduler of its board; enable, disable: turn the torque of the arm on or off; reset: clear a
-    fault of its drives; release: end robot.bring_up"""
-    tick: Tick | None = None
-    """tick at which the command is issued; give at most one of tick, at"""
-    at: Moment | None = None
-    """simulated time at which the command is issued [s]; instead of tick"""
-    joints: tuple[Finite, ...] | None = None
-    """goal: one position per joint [rad]"""
-    position: Vector | None = None
-    """goal: tool position [m]; needs quaternion or direction"""
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
-    """goal: tool orientation as w, x, y, z"""
-    direction: Vector | None = None
-    """goal: direction of the tool's z axis, with any rotation about it; default: down"""
-    home: bool = False
-    """goal: the arm's start position"""
-    name: Annotated[str, StringConstraints(max_length=MAX_NAME_BYTES)] | None = None
-    """name of a control modification or of a state table; command to carry out, as in pick block1;
-    parameter to set, as in bandwidth=80; scheduler"""
-    on: bool | None = None
-    """whether to add (true) or to remove (false) the control modification"""
-
-    @property
-    def operation(self) -> Operation:
-        """The `Operation` that `what` names."""
-        return Operation[self.what.upper()]
-
-    @property
-    def goals(self) -> list[Goal]:
-        """Forms of the goals that the command gives. A valid command gives at most one."""
-        goals = [Goal.JOINTS] if self.joints is not None else []
-        if self.position is not None or self.quaternion is not None or self.direction is not None:
-            goals.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        goals += [Goal.HOME] if self.home else []
-        return goals if self.on is None else [*goals, Goal.ON if self.on else Goal.OFF]
-
-
 class TaskEntry(NamedTuple):
     """Entry of the config for a task or a host board.
 
     Attributes:
         name: Name of the task, as in "servo" or "servo.planner".
         board: Name of its board.
-        role: "executor", "planner" or "host".
+        role: "executor", "planner", "standby" or "host".
         target: Its class, as "package.module:Class".
         slot: Its slot.
         core: The core that it requests.
@@ -433,7 +398,7 @@ class TaskEntry(NamedTuple):
     @property
     def class_key(self) -> str:
         """Key of the task's table that names the class of the task."""
-        return "program" if self.role == "host" else self.role
+        return {"host": "program", "standby": "executor"}.get(self.role, self.role)
 
     @property
     def reads_key(self) -> str:
@@ -560,6 +525,20 @@ class RackConfig(Table):
                     slot,
                     core,
                     board.planner_priority,
+                )
+
+    def list_standbys(self) -> Iterator[TaskEntry]:
+        """Yield the standbys of all boards, as in "servo.standby" and "servo.standby2"."""
+        for name, board in self.board.items():
+            for number, standby in enumerate(board.standby, start=1):
+                yield TaskEntry(
+                    f"{name}.standby{number if number > 1 else ''}",
+                    name,
+                    "standby",
+                    board.executor,
+                    standby.slot,
+                    standby.core,
+                    board.priority if standby.priority is None else standby.priority,
                 )
 
     def list_hosts(self) -> Iterator[TaskEntry]:

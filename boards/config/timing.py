@@ -8,9 +8,9 @@ from dataclasses import asdict, fields, replace
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.interrupt import get_interrupt_spec, list_sources
+from rack.boards.config.command import CommandConfig
 from rack.boards.config.schema import (
     BudgetConfig,
-    CommandConfig,
     RackConfig,
     ScheduleConfig,
 )

@@ -15,8 +15,9 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.message import escape_text
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
+from rack.backplane.standby import HAND_OVER_REASONS
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, open_alarm_ring
-from rack.backplane.words import Demand, Scheduler
+from rack.backplane.words import Demand, HandOver, Scheduler
 from rack.boards.config.cell import find_geom_name
 from rack.boards.config.loader import read_stored
 from rack.boards.config.published import PublishedRack
@@ -48,6 +49,7 @@ EVENT_KINDS: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
     Alarm.REJOINED: "recovery",
+    Alarm.TAKEN_OVER: "recovery",
     Alarm.FLOWS: "recovery",
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",
@@ -69,6 +71,8 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
     "task": {
         Alarm.HANG: "'{subject}' is not responding: {releases} missed since tick {since}",
         Alarm.REJOINED: "'{subject}' rejoined after {span}",
+        Alarm.STRAYED: "'{subject}' differs from the two other copies, and is taken out",
+        Alarm.TAKEN_OVER: "'{subject}' has taken over: {what}",
         Alarm.LATE: "'{subject}' missed its deadline: still running at its next release",
         Alarm.PLAN_LATE: "'{subject}' missed its deadline: its plan was not finished",
         Alarm.STARVED: "'{subject}' is not getting its core: {releases} missed since tick {since}",
@@ -89,6 +93,7 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
         Alarm.QUEUE_FULL: "'{subject}' is full: {messages} of '{writer}' refused",
         Alarm.INBOX_FULL: "inbox is full: {messages} in '{subject}' lost",
         Alarm.LOCKED: "'{subject}': a dead or stopped process holds the lock",
+        Alarm.DIFFERS: "'{subject}': a standby computes another {what}",
     },
     "nothing": {
         Alarm.CLOCK_STOPPED: "clock stopped: no tick for {span}",
@@ -239,7 +244,8 @@ class AlarmReader:
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
         elif about == "finding":
-            declared = self._levels[owner].findings if owner in self._levels else ()
+            level = self._find_level(owner)
+            declared = self._levels[level].findings if level in self._levels else ()
             finding = select_item(declared, number, "finding")
             code = finding.name
             subject = board = owner
@@ -249,13 +255,7 @@ class AlarmReader:
         else:
             subject = self._name_subject(about, number, owner)
             board = subject if alarm in (Alarm.REJOINED, Alarm.SCHEDULER_KEPT) else owner
-            if alarm == Alarm.SCHEDULER_KEPT:
-                words["scheduler"] = to_enum(Scheduler, value).word
-                words["what"] = escape_text(bytes(row["text"]).decode("utf-8", "replace"))
-            elif about == "mailbox":
-                words["writer"] = self._layout.mailboxes[number].writer
-            elif about == "geom":
-                words["writer"] = self._geom(to_integer(value))
+            words |= self._describe_details(alarm, about, row)
         span = self._format_span(value)
         text = text.format(
             **words,
@@ -288,6 +288,26 @@ class AlarmReader:
             since=since,
         )
 
+    def _describe_details(self, alarm: Alarm, about: str, row: np.void) -> dict[str, object]:
+        """Return further words for the text of an alarm, by name.
+
+        Args:
+            alarm: Kind of alarm.
+            about: Kind of its subject.
+            row: The record of the alarm.
+        """
+        what = escape_text(bytes(row["text"]).decode("utf-8", "replace"))
+        words: dict[str, object] = {"what": what}
+        if alarm == Alarm.SCHEDULER_KEPT:
+            words["scheduler"] = to_enum(Scheduler, float(row["value"])).word
+        elif alarm == Alarm.TAKEN_OVER:
+            words["what"] = HAND_OVER_REASONS[to_enum(HandOver, float(row["value"]))]
+        elif about == "mailbox":
+            words["writer"] = self._layout.mailboxes[int(row["subject"])].writer
+        elif about == "geom":
+            words["writer"] = self._geom(to_integer(float(row["value"])))
+        return words
+
     def _name_subject(self, about: str, number: int, owner: str) -> str:
         """Return the name of an alarm's subject. Raises `DamageError` if there is no such subject.
 
@@ -306,7 +326,8 @@ class AlarmReader:
             case "geom":
                 return self._geom(number)
             case "name":
-                names = self._levels[owner].names if owner in self._levels else ()
+                level = self._find_level(owner)
+                names = self._levels[level].names if level in self._levels else ()
                 return select_item(names, number, "name")
             case "brakes" if number > 0:
                 return to_enum(Error, number).name.lower()
@@ -329,6 +350,11 @@ class AlarmReader:
         before = self._live.get((board, key), param and param.launched)
         self._live[board, key] = value
         return f", before {before}"
+
+    def _find_level(self, owner: str) -> str:
+        """Return the name of the level that the owner of an alarm ring runs."""
+        standbys = {task.name: task.board for task in self._layout.tasks if task.role == "standby"}
+        return standbys.get(owner, owner)
 
     def _name_task(self, number: int, other: str) -> str:
         """Return the name of a task by its number, or `other` for a negative number."""

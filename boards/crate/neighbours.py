@@ -129,7 +129,7 @@ def find_conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     """Return a line for each core that real-time tasks of this config share with another rack."""
     tasks = [
         (CLOCK, config.clock.core, config.clock.priority),
-        *((t.name, t.core, t.priority) for t in config.list_tasks()),
+        *((t.name, t.core, t.priority) for t in (*config.list_tasks(), *config.list_standbys())),
     ]
     requested: dict[int, list[str]] = {}
     for task, core, priority in tasks:

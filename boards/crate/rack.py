@@ -161,14 +161,8 @@ class Rack:
             Preload(list_class_names(self.config), tuple(sys.path), build_cell_config(self.config))
         )
         plan = resolve(self.config).for_run(self._repeats, self._entries)
-        if self._snapshots is not None:
-            # In a replay there is no outside state: the wiring contains the recorded messages.
-            is_replay = any(task.entries is not None for task in plan.tasks)
-            why = "" if is_replay else self.config.outside_state
-            if not self.config.is_lockstep:
-                why = "they are taken in lockstep; add --lockstep"
-            if why:
-                raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
+        if self._snapshots is not None and (why := self._find_snapshot_obstacle(plan)):
+            raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
         launch_checks.check_open_files(plan)
         remove_dead_rack(self.config.name)
         segment = Segment.create(plan.layout, self.config.to_toml_text(), plan.published.to_json())
@@ -199,6 +193,16 @@ class Rack:
         self._fill_tables(plan, crate)
         for note in (*moved, *launch_checks.list_launch_notes(plan, segment)):
             self._journal.add_event("ready", "", note)
+
+    def _find_snapshot_obstacle(self, plan: Resolved) -> str:
+        """Return why no snapshots can be taken. Empty if they can."""
+        if not self.config.is_lockstep:
+            return "they are taken in lockstep; add --lockstep"
+        if self.config.clock.standby is not None:
+            return "its clock has a standby"
+        # In a replay there is no outside state: the wiring contains the recorded messages.
+        is_replay = any(task.entries is not None for task in plan.tasks)
+        return "" if is_replay else self.config.outside_state
 
     def _fill_tables(self, plan: Resolved, crate: CrateLine) -> None:
         """Enter faults and commands into their tables, and start the processes of hog faults."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
-from rack.backplane.address_map import CLOCK
+from rack.backplane.address_map import CLOCK, CLOCK_STANDBY
 from rack.backplane.layout import Layout
 from rack.backplane.process import STOPPED_STATES, describe_end, read_state
 from rack.backplane.segment import Segment
@@ -23,6 +23,7 @@ from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
+CLOCKS = (CLOCK, CLOCK_STANDBY)
 UP_STATES = (TaskState.READY, TaskState.RUNNING)
 """States of a board that has passed its self-test and has not ended."""
 
@@ -41,7 +42,11 @@ class RestartPolicy:
         self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.find_boards_below(task.board)
-            needed = {other.name for other in layout.tasks if other.board in below}
+            needed = {
+                other.name
+                for other in layout.tasks
+                if other.board in below and other.role != "standby"
+            }
             self._needs[task.name] = {CLOCK, *needed} | (
                 {task.board} if task.role == "planner" else set()
             )
@@ -54,7 +59,7 @@ class RestartPolicy:
         """
         common = self._config.supervision
         max_restarts, within_s = common.restarts, common.within_s
-        if task != CLOCK:
+        if task not in CLOCKS:
             board = self._config.get_table(self._layout.find_task(task))
             max_restarts = max_restarts if board.restarts is None else board.restarts
             board_s = board.restarts_within_s
@@ -112,6 +117,7 @@ class Recovery:
         """Power on the clock and the host boards, and enable restarts of lost boards."""
         self.wirings = {
             CLOCK: clock,
+            **plan.build_clock_standbys(clock),
             **{host.board: host for host in plan.hosts if not host.is_external},
             **{task.task: task for task in plan.tasks},
         }
@@ -152,8 +158,9 @@ class Recovery:
             return
         else:
             text = f"{text}; no restarts left"
-        if name == CLOCK:
-            self.is_beyond_help = True
+        if name in CLOCKS:
+            others = [clock for clock in CLOCKS if clock in self.wirings and clock != name]
+            self.is_beyond_help = self.is_beyond_help or not others
         else:
             # The clock reacts to this state by braking the arm and ending the run.
             self._segment.get_block(name)[Block.STATE] = TaskState.GIVEN_UP
@@ -189,7 +196,7 @@ class Recovery:
         self._starting = [
             name
             for name in self._starting
-            if name != CLOCK and self._segment.get_block(name)[Block.STATE] not in UP_STATES
+            if name not in CLOCKS and self._segment.get_block(name)[Block.STATE] not in UP_STATES
         ]
         for board in self._supervision.list_startable(self._waiting, self._starting):
             self._waiting.remove(board)

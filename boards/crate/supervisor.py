@@ -16,18 +16,20 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System
 from rack.boards.config.resolved import Resolved
-from rack.boards.crate.alarm_events import AlarmReader
+from rack.boards.crate.alarm_events import AlarmReader, ReadAlarm
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import find_late_tasks
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.patience import PeerWaitReporter, ReportedWait
-from rack.boards.crate.recovery import UP_STATES, Recovery, RestartPolicy
+from rack.boards.crate.recovery import CLOCKS, UP_STATES, Recovery, RestartPolicy
 from rack.boards.crate.requests import Ended, Forked, ForkFailed
-from rack.boards.errors import NO_SNAPSHOTS_PREFIX, LaunchError
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX, ConfigError, LaunchError, Mistake
 from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, list_brakings
 
 MOST_TICKS = 1 << 48
 """Number of ticks that no run reaches. A larger number in the segment is damage."""
+EARLY_NS = 1_000_000_000
+"""Simulated time, in ns, in which copies of a level differ only if it is not deterministic."""
 LAST_CYCLES_S = 0.2
 """Time that boards have to finish their last cycles before these are counted."""
 STOP_S = 0.8
@@ -100,17 +102,10 @@ class Supervisor:
                 self._journal.add_event("stop", "", self._why_stopped)
             self._record_printed()
             for raised in self.alarms.read_alarms():
-                # Record each alarm as an event, and kill a process that hangs.
-                self._journal.record_event(raised.event)
-                if raised.alarm == Alarm.HANG:
-                    task = select_item(self.plan.layout.tasks, raised.subject, "task")
-                    self.recovery.kill_hanging(task.name)
-                elif raised.alarm == Alarm.CLOCK_STOPPED and raised.subject == self.pids.get(CLOCK):
-                    # Kill the clock only if it is still the reported process and not its successor.
-                    self.recovery.kill_hanging(CLOCK)
+                self._handle_alarm(raised)
             for board in self._heartbeat.find_hanging():
                 self.recovery.report_hanging(board)
-                self.recovery.kill_hanging(board)
+                self._kill_hanging(board)
             self._awaited.report_if_due()
             self.recovery.restart_due_boards()
             if not self.is_armed:
@@ -121,6 +116,41 @@ class Supervisor:
             if time.monotonic() >= deadline:
                 break
         return self.outcome is None
+
+    def _handle_alarm(self, raised: ReadAlarm) -> None:
+        """Record an alarm as an event, and kill a process that hangs or has strayed.
+
+        Raises:
+            ConfigError: Two copies of a level are compared, which is not deterministic.
+        """
+        self._journal.record_event(raised.event)
+        if raised.alarm in (Alarm.HANG, Alarm.STRAYED):
+            task = select_item(self.plan.layout.tasks, raised.subject, "task")
+            self.recovery.kill_hanging(task.name)
+        elif raised.alarm == Alarm.CLOCK_STOPPED:
+            # Kill the clock only if it is still the reported process and not its successor.
+            self._kill_clock(raised.subject)
+        elif raised.alarm == Alarm.DIFFERS:
+            board = self.plan.layout.find_task(raised.event.board).board
+            words = self.segment.words
+            is_disturbed = words[System.INJECTED] or self.segment.get_block(board)[Block.HAND_OVERS]
+            is_early = raised.event.tick * self.plan.layout.clock_ns < EARLY_NS
+            if is_early and not is_disturbed:
+                why = f"the level is not deterministic: {raised.event.text}, at the start"
+                raise ConfigError([Mistake(f"board.{board}.compare", True, why)])
+
+    def _kill_hanging(self, board: str) -> None:
+        """Kill a hanging board, or the process that runs the clock."""
+        if board == CLOCK:
+            self._kill_clock(self.segment.words[System.CLOCK_PID])
+        else:
+            self.recovery.kill_hanging(board)
+
+    def _kill_clock(self, pid: int) -> None:
+        """Kill a process if it is the clock or its standby."""
+        for name in CLOCKS:
+            if self.pids.get(name) == pid:
+                self.recovery.kill_hanging(name)
 
     def stop(self, why: str) -> None:
         """End the run at the next tick. Safe to call at any time, even in a signal handler."""
@@ -168,12 +198,12 @@ class Supervisor:
                 self.pids[name] = pid
             case Ended(name, _, status) as end:
                 self.pids.pop(name, None)
-                is_board = name == CLOCK or name in self.segment.map.blocks
+                is_board = name in CLOCKS or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
                     # The restart policy applies to a board that died before the run stopped, even
                     # if its end is reported later.
-                    died_before = name != CLOCK and self.segment.get_block(name)[Block.LOST]
+                    died_before = name not in CLOCKS and self.segment.get_block(name)[Block.LOST]
                     is_late = self._is_stopped and not died_before
                     self.recovery.record_loss(end, is_late, self._record_printed)
             case None:

@@ -295,5 +295,5 @@ def forge_message(segment: Segment, mailbox: str, tick: int) -> None:
     if head:
         slots.fetch_message(head)
     slots.message.raw[:] = bytes(byte ^ 0xFF for byte in slots.message.raw)
-    slots.resume_writing(build_signature(slots.box[Box.EPOCH], os.getpid()))
+    slots.resume_writing(build_signature(slots.box[Box.EPOCH], os.getpid()), head)
     slots.publish_message(tick, tick, tick)

@@ -121,6 +121,11 @@ class TaskFaults:
         self._spec = spec
         self._tasks = segment.layout.tasks
         self._index = segment.layout.processes.index(spec)
+        # A fault of the arm strikes what all copies of a task simulate.
+        self._copies = {self._index}
+        if spec.role in ("executor", "standby"):
+            copies = segment.layout.list_copies(spec.board)
+            self._copies = {segment.layout.processes.index(copy) for copy in copies}
         self._apply = apply
         self._level = level
         self._clock = SystemClock(segment)
@@ -142,7 +147,11 @@ class TaskFaults:
         entries = self._table.list_entries((Stage.ACTIVE,))
         if self._clock.is_lockstep:
             self._refresh_simulated_faults(entries, tick)
-        begun = [(find_kind(entry), entry) for entry in entries if entry.task == self._index]
+        begun = [
+            (kind, entry)
+            for kind, entry in ((find_kind(entry), entry) for entry in entries)
+            if entry.task == self._index or (kind.where == "arm" and entry.task in self._copies)
+        ]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
@@ -152,7 +161,7 @@ class TaskFaults:
         self._apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
         arm_faults = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm_faults]
-        if self._spec.role == "executor":
+        if self._spec.role != "planner":
             faults = [
                 Fault(kind.name, kind.read_parameters(entry), entry.seed, entry.tick, kind.step)
                 for kind, entry in arm_faults

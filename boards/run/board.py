@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib import import_module
 from socket import socket
 from zlib import crc32
 
@@ -23,18 +24,21 @@ from rack.backplane.process import (
     take_core,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Scheduler, System, TaskState
+from rack.backplane.words import Block, Run, Scheduler, System, TaskState
 from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import TaskCopies, has_snapshots_enabled
 from rack.boards.run.system_controller import run_clock
+from rack.boards.run.task import Task
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
 
+CLOCK_LOCK = "rack.boards.run.clock_standby"
+REPLICA = "rack.boards.run.replica"
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
 REPEATS_FACTOR = 1 << 16
@@ -124,7 +128,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
     copier = Copier(segment, wiring.task, copies) if has_snapshots_enabled(segment) else None
     block = segment.get_block(wiring.task)
     kind: type[Executor] | type[Planner] = find_class(
-        wiring.target, Executor if spec.role == "executor" else Planner
+        wiring.target, Planner if spec.role == "planner" else Executor
     )
     level = kind(wiring.context)
     if isinstance(level, Adapter):
@@ -145,11 +149,14 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         hold_memory(lockstep)
         if isinstance(level, Adapter):
             level.open_connections()
-        task = (
-            VirtualControlLoop(segment, wiring, level, attention)
-            if isinstance(level, Executor)
-            else PlannerLoop(segment, wiring, level, attention)
-        )
+        task: Task
+        if isinstance(level, Planner):
+            task = PlannerLoop(segment, wiring, level, attention)
+        elif len(segment.layout.list_copies(spec.board)) > 1:
+            # Import it only in racks that have standbys.
+            task = import_module(REPLICA).ReplicatedLoop(segment, wiring, level, attention)
+        else:
+            task = VirtualControlLoop(segment, wiring, level, attention)
         if copier is not None:
             task.next_cycle.copy = TaskCopies(task, level, copier, attention)
         block[Block.STATE] = TaskState.READY
@@ -195,6 +202,14 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     # Memory is not touched in advance, because every board waits for the start of the clock. The
     # clock's lead over its grid points leaves enough time for a page fault.
     hold_memory(wiring.lockstep)
+    lock = None
+    if wiring.copy is not None:
+        # Import it only in racks whose clock has a standby.
+        lock = import_module(CLOCK_LOCK).await_clock_lock(segment, is_standby=wiring.copy > 0)
+        if segment.words[System.STATE] == Run.STOPPED:
+            return 0
     with keep_cores_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)
+    if lock is not None:
+        lock.close()
     return 0

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import GOOD_OFFSET, NO_MESSAGE_TICK
-from rack.backplane.mailbox.slots import CHECKED_FROM, SIGNED_FROM, Slots
-from rack.backplane.words import Slot
+from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, SIGNED_FROM, Slots
+from rack.backplane.words import Box, Slot
 from rack.boards.run.instructions import (
     copy,
     fence,
@@ -71,6 +71,7 @@ PORT = _build_dtype(
 """Record type of a mailbox that compiled code reads or writes."""
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
+_CLAIMANT = 8 * Box.CLAIMANT
 _PORT_SIZE = PORT.itemsize
 OLD_RESULT, NEW_RESULT, CHECK_MESSAGES, CHECK_SILENCE, READ_IN_PYTHON = 0, 1, 2, 4, 8
 """Results of a read, of which the last three are bits that can be combined.
@@ -101,7 +102,7 @@ def take(port: Any, serial: int) -> bool:
         serial: Serial of the message.
 
     Returns:
-        False if Python must handle the message, because it is bad or from a new writer.
+        False if Python must handle the message, because it is bad or from a new or former writer.
     """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
@@ -111,7 +112,10 @@ def take(port: Any, serial: int) -> bool:
     state = state_at(port.state)
     if received.serial != serial or received.signature != state.signature:
         return False
-    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != received.check:
+    check = received.check ^ (received.signature & EPOCH_MASK)
+    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != check:
+        return False
+    if received.signature != load(port.head + _CLAIMANT):
         return False
     copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1
@@ -136,7 +140,7 @@ def read_port(port: Any, tick: int) -> int:
     while port.is_sliced and serial > oldest and load(slot_of(port, serial) + _VISIBLE) > tick:
         serial -= 1
     result = OLD_RESULT
-    if serial != state.serial:
+    if serial > state.serial:
         if not port.is_watched or not take(port, serial):
             return READ_IN_PYTHON
         result = NEW_RESULT
@@ -185,8 +189,9 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     record.serial = before + 1
     record.tick = tick
     record.visible = tick + port.delay
-    record.chain = record.check
-    record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
+    epoch = record.signature & EPOCH_MASK
+    record.chain = record.check ^ epoch
+    record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain) ^ epoch
     # Other processes must see the stores in this order: the mailbox's head for the previous
     # message, this message, its signature, and the mailbox's head for this message.
     fence()

@@ -300,7 +300,7 @@ class OutputPorts:
             for port, name in mailboxes.items()
             if port in level.outputs
         }
-        self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
+        self.writers = {port: self.open_writer(segment, name) for port, name in mailboxes.items()}
         self._ports: list[OutputPort] = []
         for port, writer in self.writers.items():
             sources = [inputs.readers[name] for name in writer.spec.rests_on]
@@ -313,6 +313,10 @@ class OutputPorts:
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
         self._others = [port for port in self._ports if not can_write(port.writer)]
         self._is_faulty = False
+
+    def open_writer(self, segment: Segment, name: str) -> Writer:
+        """Open and claim a mailbox."""
+        return open_writer(segment, name)
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Set the active faults of all mailboxes. Each port applies those that concern it."""

@@ -34,13 +34,15 @@ from rack.boards.operator import build_hold_command, find_level
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import ClockWiring
-from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer, Operation
+from rack.levels.operator import PASSING_OPERATIONS, Answer, Operation
 
 if TYPE_CHECKING:
+    from rack.boards.run.hand_over import HandOverDirector
     from rack.boards.run.scheduling import SchedulerChanges
     from rack.boards.run.simulated_cores import SimulatedCores
 
 SCHEDULING = "rack.boards.run.scheduling"
+HAND_OVER = "rack.boards.run.hand_over"
 SIMULATED_CORES = "rack.boards.run.simulated_cores"
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
@@ -74,6 +76,11 @@ class SystemController:
             self._desk.changes = import_module(SCHEDULING).SchedulerChanges(
                 segment, driver.tasks, wiring.schedulings, driver.alarms
             )
+        self._hand_overs: HandOverDirector | None = None
+        if any(task.role == "standby" for task in segment.layout.tasks):
+            # Import it only in racks that have standbys.
+            self._hand_overs = import_module(HAND_OVER).HandOverDirector(segment, driver)
+            self._desk.hand_overs = self._hand_overs
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
         self.cores: SimulatedCores | None = None
@@ -87,6 +94,8 @@ class SystemController:
             faults.advance_faults(tick)
         if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
             desk.issue_due_commands(tick)
+        if self._hand_overs is not None:
+            self._hand_overs.check_active_copies()
         if self._settled != (
             words[System.LOSSES],
             self._driver.watchdog.losses,
@@ -125,7 +134,9 @@ class SystemController:
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
         demands = [
-            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
+            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index)
+            for task in lost
+            if self._hand_overs is None or not self._hand_overs.is_served(task)
         ]
         if emergency:
             demands.append((Demand.BRAKE, -1))
@@ -179,12 +190,14 @@ class OperatorCommandIssuer:
         requested: Number of requests that the operator table had when it was last read.
         next_tick: First tick with work to do, unless there are new requests.
         changes: Changes of schedulers. None if the rack names no scheduler.
+        hand_overs: Hand-overs to standbys. None if the rack has none.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
         self._words = segment.words
         self._alarms = alarms
         self.changes: SchedulerChanges | None = None
+        self.hand_overs: HandOverDirector | None = None
         self._layout = segment.layout
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
@@ -247,7 +260,9 @@ class OperatorCommandIssuer:
             board = find_level(entry, self._layout)
             self.changes.change_scheduler(board, message.name, tick)
         entry.stage = RequestStage.GIVEN
-        if message.what not in (*SETTINGS, *DRIVE_OPERATIONS):
+        if message.what == Operation.SWITCH and self.hand_overs is not None:
+            self.hand_overs.switch(find_level(entry, self._layout))
+        if message.what not in PASSING_OPERATIONS:
             self._newest[entry.mailbox] = message.id
         self._alarms.raise_alarm(tick, Alarm.COMMANDED, entry.index, entry.serial)
         if entry.client == Client.LEASES:

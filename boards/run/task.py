@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from time import process_time_ns
-from typing import ParamSpec, TypeVar
+from typing import ClassVar, ParamSpec, TypeVar
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.clock.wake import NextCycle
@@ -38,6 +38,8 @@ class Task(ABC):
         serve: Function that serves the board's interrupts in each cycle. None if nothing
             interrupts the board, or another of its tasks serves the interrupts.
     """
+
+    outputs_class: ClassVar[type[OutputPorts]] = OutputPorts
 
     def __init__(
         self,
@@ -72,7 +74,7 @@ class Task(ABC):
             inbox=inbox,
         )
         self.inputs.task.now = self.clock.compute_tick
-        self.outputs = OutputPorts(
+        self.outputs = self.outputs_class(
             segment, level, wiring.outputs, self.alarms, self.inputs, wiring.sent
         )
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)

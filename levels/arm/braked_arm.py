@@ -29,6 +29,8 @@ class BrakedArm(Plant, ABC):
     Its joints have drives and brakes, and its gripper is controlled by force.
     """
 
+    is_simulated = False
+    """True if each of several processes can have the arm, as a simulation of its own."""
     reports_torque = False
     """True if `torque` is the torque of the motors for the coming cycle after `follow`.
 

@@ -46,7 +46,7 @@ class SimulatedArm(Simulation, Arm):
     data.
     """
 
-    keeps_limits = True
+    keeps_limits = is_simulated = True
     sensors = SensorConfig()
 
     def __init__(

@@ -11,12 +11,14 @@ A cycle has three phases:
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from rack.backplane.message import Message
 from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
@@ -152,6 +154,26 @@ class ArmDriver(Executor):
             method = "drive" if interface == "torque" else "follow"
             text = f'no `{method}` of the class takes [robot] interface "{interface}"'
             yield "params.arm", reference, text
+
+    @classmethod
+    def find_standby_obstacle(cls, params: Mapping[str, Any]) -> str:
+        """Return why the level cannot have a standby: it drives an arm that is not simulated.
+
+        Two processes can each simulate an arm, but cannot both have a connection to drives.
+        """
+        reference = params.get("arm", ArmParams.model_fields["arm"].default)
+        with suppress(ValueError):
+            kind = find_arm(reference)
+            if not kind.is_simulated:
+                return f"arm {kind.__name__} is not a simulation, and one process must drive it"
+        return super().find_standby_obstacle(params)
+
+    def realign(self, state: Message) -> None:
+        """Continue the simulation and the estimates from a state of the active copy."""
+        assert isinstance(state, ArmState), "the port `state`"
+        self.arm.restore(state)
+        self.sensors.restore_estimate(state)
+        self.stopping.restore_state(state)
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults that are injected between this level and the arm."""

@@ -9,8 +9,7 @@ import numpy as np
 from rack.backplane.mailbox.mailbox import Reading
 from rack.levels.algebra import Array, Mask
 from rack.levels.operator import (
-    DRIVE_OPERATIONS,
-    SETTINGS,
+    PASSING_OPERATIONS,
     Operation,
     OperatorCommand,
     Orders,
@@ -94,7 +93,7 @@ class OperatorControl:
 
     def _process_command(self, command: OperatorCommand) -> None:
         """Accept or refuse the goal of a SETPOINT, a setting or a command to the drives."""
-        if command.what in (*SETTINGS, *DRIVE_OPERATIONS):
+        if command.what in PASSING_OPERATIONS:
             if refusal := self._obey(command):
                 self.orders.refuse_newest(refusal)
         elif self.orders.standing is Operation.SETPOINT:

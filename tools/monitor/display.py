@@ -208,6 +208,7 @@ class RackView:
                 )
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
+        yield from (Text(standby.line) for standby in snapshot.standbys)
         yield from (Text(_format_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:

@@ -74,9 +74,12 @@ def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
 def count_restarts(segment: Segment, writer: str) -> int:
     """Count how often a new process took over the mailboxes of a task or host board.
 
-    Each new process increments the writer's epoch. The first process writes in epoch 1.
+    Each new process increments the writer's epoch. The first process writes in epoch 1. Hand-overs
+    to standbys, which increment it too, are not counted.
     """
-    return max([0, *(head[Box.EPOCH] - 1 for head in _list_heads(segment, writer))])
+    hand_overs = segment.get_block(writer)[Block.HAND_OVERS]
+    heads = _list_heads(segment, writer)
+    return max([0, *(head[Box.EPOCH] - 1 - hand_overs for head in heads)])
 
 
 def _list_heads(segment: Segment, writer: str) -> list[memoryview]:

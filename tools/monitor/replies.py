@@ -12,7 +12,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.message import decode_text
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
+from rack.levels.operator import CLOCK_OPERATIONS, DRIVE_OPERATIONS, SETTINGS, Answer
 
 REPLY_CYCLES = 4
 """Number of a level's cycles within which it replies.
@@ -137,7 +137,7 @@ class ReplyReader:
     def _supersedes(self, serial: int) -> bool:
         """Return whether a newer accepted command supersedes this one."""
         kind = self._kinds.get(serial)
-        if kind in SETTINGS:
+        if kind in (*SETTINGS, *CLOCK_OPERATIONS):
             return False
         return (
             kind not in DRIVE_OPERATIONS or self._kinds.get(self.reply.serial) in DRIVE_OPERATIONS

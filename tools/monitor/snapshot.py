@@ -14,6 +14,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.message import AnyMessage, format_state, get_reason
 from rack.backplane.segment import Segment
+from rack.backplane.standby import ReplicatedTask, list_standbys
 from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block, Demand, Run, Scheduler, System, TaskState
 from rack.boards.exchange import EXCHANGE_PORT, PortAge, list_port_ages
@@ -114,6 +115,7 @@ class Snapshot:
         peers: Other racks on the network.
         imports: Messages from other racks.
         exports: Messages to other racks.
+        standbys: Tasks with standbys: which copy is active, since when and why.
     """
 
     rack: str
@@ -135,6 +137,7 @@ class Snapshot:
     peers: tuple[PeerRow, ...]
     imports: tuple[ImportRow, ...]
     exports: tuple[ExportRow, ...]
+    standbys: tuple[ReplicatedTask, ...]
 
 
 class RackMonitor:
@@ -194,6 +197,7 @@ class RackMonitor:
             peers=list_peers(self._newest),
             imports=list_imports(self._newest),
             exports=list_exports(self._newest),
+            standbys=list_standbys(segment),
             exchanges={
                 board: list_port_ages(message)
                 for board, message in self._list_messages(EXCHANGE_PORT)

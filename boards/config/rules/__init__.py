@@ -16,6 +16,8 @@ from rack.boards.config.rules import boards, levels, mailboxes
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake, Mistakes
 
+STANDBYS = "rack.boards.config.rules.standbys"
+"""Module with the rules of standbys. Only a rack with standbys loads it."""
 NETWORK = "rack.boards.config.rules.lan"
 """Module with the rules of `[adapter.lan]`. Only a rack with a network loads it."""
 
@@ -29,6 +31,14 @@ def _check_network(wiring: Wiring) -> Mistakes:
     """Check the table `[adapter.lan]`, if the rack has one."""
     if (rules := load_network_rules(wiring.config)) is not None:
         yield from rules.check_network(wiring, wiring.config.adapter.lan)
+
+
+def _check_standbys(wiring: Wiring) -> Mistakes:
+    """Check the standbys of boards and clock, if the rack has any."""
+    config = wiring.config
+    keys = [board.standby or board.compare or board.vote for board in config.board.values()]
+    if config.clock.standby is not None or any(keys):
+        yield from import_module(STANDBYS).check_standbys(wiring)
 
 
 Rule = Callable[[Wiring], Mistakes]
@@ -57,6 +67,7 @@ RULES: tuple[Rule, ...] = (
     mailboxes.check_queues,
     mailboxes.check_asynchronous,
     mailboxes.check_interrupts,
+    _check_standbys,
     levels.check_params,
     levels.check_programs,
     levels.check_cell,

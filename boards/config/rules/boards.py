@@ -146,8 +146,15 @@ def check_circles(wiring: Wiring) -> Mistakes:
 def check_slots(wiring: Wiring) -> Mistakes:
     """Check that no two boards have the same slot."""
     taken: dict[int, str] = {}
+    if (clock := wiring.config.clock.standby) is not None:
+        taken[clock.slot] = "clock.standby.slot"
     for name, board in wiring.config.board.items():
-        for key, slot in (("slot", board.slot), ("planner_slot", board.planner_slot)):
+        standbys = [
+            (f"standby[{number}].slot" if len(board.standby) > 1 else "standby.slot", copy.slot)
+            for number, copy in enumerate(board.standby)
+        ]
+        slots = (("slot", board.slot), ("planner_slot", board.planner_slot), *standbys)
+        for key, slot in slots:
             place = f"board.{name}.{key}"
             if slot is not None and slot in taken:
                 yield Mistake(place, slot, f"the slot is already taken by {taken[slot]}")
@@ -224,7 +231,8 @@ def check_polling(wiring: Wiring) -> Mistakes:
     Otherwise it would starve the other tasks on its core.
     """
     config = wiring.config
-    cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.list_tasks()}
+    places = (*config.list_tasks(), *config.list_standbys())
+    cores = {CLOCK: config.clock.core} | {place.name: place.core for place in places}
     for name, board in config.board.items():
         others = [other for other, core in cores.items() if core == board.core and other != name]
         if (board.wake or config.clock.wake) == "poll" and others:

@@ -6,6 +6,10 @@ visits every state that an interleaving leads to, breadth first, and checks in e
 - A reader returns only messages that were published, each as it was published, in order.
 - No reader takes a published message for a damaged or a forged one.
 - Each message is published under the claim that is valid: there is one at a time.
+- A writer that is stopped may be replaced while it lives. It still makes the stores of one
+  publication, at any time, and no reader returns that message once its claim is not valid any more.
+  It may set the head to where its successor works: a complete message of that is then as good as
+  published.
 - Nobody waits: each process can always take its next step.
 
 Three memories: sequential consistency (SC); x86-TSO, where stores wait in a buffer, first in, first
@@ -28,8 +32,12 @@ from typing import NamedTuple
 
 PUBLISH = ("fence", "store message", "fence", "store signature", "fence", "store head")
 LOSE = ("fence", "store head")
-CLAIM = ("store claim", "clear slot")
-READ = ("load head", "fence", "load signature", "fence", "load message")
+CLAIM = ("store begun", "fence", "store claim", "clear slot")
+READ = ("load head", "fence", "load signature", "fence", "load message", "load claim")
+FORMER = ("fence", "load begun")
+"""Further accesses by which a reader checks a message of an earlier epoch than that of the claim.
+The model makes them together with the load of the claim: what a word contains does not change while
+its epoch, or the one after it, is the newest."""
 JUDGE = ("fence", "load head")
 """Accesses by which a reader learns whether a slot was reused while it was copied."""
 SIGNATURE = "e"
@@ -56,6 +64,7 @@ class Setup:
         published: Messages that exist at the beginning.
         messages: Maximum number of messages published after that.
         kills: Maximum number of times that the writer is killed.
+        stops: Maximum number of times that the writer is stopped, and replaced while it lives.
         losses: Maximum number of serials published without a message.
         forgeries: Maximum number of messages published by a process without the claim. Each is
             published at once, and not while the writer publishes.
@@ -66,11 +75,13 @@ class Setup:
         publish: Accesses of a writer that publishes a message.
         lose: Accesses of a writer that publishes a serial without its message.
         claim: Accesses of a writer that begins.
-        read: Accesses of a reader that takes a message. If it does not know the writer yet, it
-            loads the claim, too.
+        read: Accesses of a reader that takes a message.
         judge: Accesses of a reader after a bad copy.
         is_checked: True if a reader checks the checksum.
         is_claimed: True if a reader checks the writer.
+        is_bound: True if the checksum is combined with the epoch of the writer.
+        is_bounded: True if a reader compares serials of earlier epochs with the words of `FORMER`.
+        is_claim_loaded: True if a reader loads the claim even if it knows the writer.
         is_locked: True if a writer begins only after its predecessor is dead.
         waits: True if a reader waits while its slot is being filled.
     """
@@ -80,6 +91,7 @@ class Setup:
     published: int = 3
     messages: int = 5
     kills: int = 1
+    stops: int = 0
     losses: int = 0
     forgeries: int = 0
     readers: int = 1
@@ -92,6 +104,9 @@ class Setup:
     judge: tuple[str, ...] = JUDGE
     is_checked: bool = True
     is_claimed: bool = True
+    is_bound: bool = True
+    is_bounded: bool = True
+    is_claim_loaded: bool = True
     is_locked: bool = True
     waits: bool = False
 
@@ -99,7 +114,7 @@ class Setup:
 class Store(NamedTuple):
     """A store that a writer has not made yet."""
 
-    place: str  # "head", "claim" or "slot"
+    place: str  # "head", "claim", "begun" or "slot"
     value: int
     slot: int = 0
     word: int = 0
@@ -116,6 +131,7 @@ class Writer(NamedTuple):
     stores: tuple[Store, ...]
     buffer: tuple[Store, ...] = ()  # under TSO: made, and not yet visible
     is_alive: bool = True
+    is_stopped: bool = False
 
 
 class Reader(NamedTuple):
@@ -128,6 +144,7 @@ class Reader(NamedTuple):
     has_head: bool = False
     copied: tuple[int, ...] = ()  # messages of which it has copied the words; -1: none yet
     claim: int = -1  # as it has found it; -1: not yet
+    begun: tuple[int, ...] = ()  # as it has found it, with the claim
     head: int = -1  # as it has found it after the copy; -1: not yet
 
 
@@ -136,11 +153,15 @@ class State(NamedTuple):
 
     head: int
     claim: int
+    begun: tuple[int, ...]  # serial of the newest message when an epoch began, by epoch
     slots: tuple[tuple[int, ...], ...]
-    epochs: tuple[int, ...]  # of the writers of all published messages; -1: of none
+    # Of the writers of all published messages: of none of a serial that is forged or lost, of two
+    # if a stopped writer published it just before the next epoch began.
+    epochs: tuple[tuple[int, ...], ...]
     writers: tuple[Writer, ...]
     readers: tuple[Reader, ...]
     kills: int
+    stops: int
     losses: int
     forgeries: int
 
@@ -215,11 +236,13 @@ class _Model:
         return State(
             head=setup.published,
             claim=1,
+            begun=(0,) * EPOCHS,
             slots=tuple(slots),
-            epochs=(1,) * (setup.published + 1),
+            epochs=((1,),) * (setup.published + 1),
             writers=(Writer(1, setup.published, ()),),
             readers=(Reader(setup.published, 1, setup.reads),) * setup.readers,
             kills=setup.kills,
+            stops=setup.stops,
             losses=setup.losses,
             forgeries=setup.forgeries,
         )
@@ -248,25 +271,41 @@ class _Model:
             return of._replace(writers=(*of.writers[:at], after, *of.writers[at + 1 :]))
 
         for store, buffer in self._next(writer.buffer):
-            after = self._stored(state, store, writer.epoch)
-            yield f"seen: {store}", moved(writer._replace(buffer=buffer), after)
+            stored = self._stored(state, store, writer)
+            yield f"seen: {store}", moved(writer._replace(buffer=buffer), stored)
         if not writer.is_alive:
             return
-        if state.losses and self._may_issue(writer):
-            losing = self._issued(writer, self._setup.lose)
-            yield f"lose {losing.issued}", moved(losing)._replace(losses=state.losses - 1)
-        writer = self._continued(writer)
+        if not writer.is_stopped:
+            for step, after, changed in self._turns(state, writer):
+                yield step, moved(after)._replace(**changed)
+            writer = self._continued(writer)
         if self._setup.memory is Memory.TSO:
             for store in writer.stores[:1]:
                 after = writer._replace(stores=writer.stores[1:], buffer=(*writer.buffer, store))
                 yield f"store: {store}", moved(after)
         else:
             for store, stores in self._next(writer.stores):
-                after = self._stored(state, store, writer.epoch)
-                yield f"store: {store}", moved(writer._replace(stores=stores), after)
+                stored = self._stored(state, store, writer)
+                yield f"store: {store}", moved(writer._replace(stores=stores), stored)
+
+    def _turns(self, state: State, writer: Writer) -> Iterator[tuple[str, Writer, dict[str, int]]]:
+        """Yield what may happen to a writer: it loses a message, is stopped or is killed."""
+        if state.losses and self._may_issue(writer):
+            losing = self._issued(writer, self._setup.lose)
+            yield f"lose {losing.issued}", losing, {"losses": state.losses - 1}
+        writer = self._continued(writer)
+        # A process that is stopped while it claims keeps others from taking over.
+        if state.stops and all(store.publication for store in (*writer.stores, *writer.buffer)):
+            yield "stop the writer", self._stopped(writer), {"stops": state.stops - 1}
         if state.kills:
             dead = Writer(writer.epoch, 0, (), writer.buffer, is_alive=False)
-            yield "kill the writer", moved(dead)._replace(kills=state.kills - 1)
+            yield "kill the writer", dead, {"kills": state.kills - 1}
+
+    def _stopped(self, writer: Writer) -> Writer:
+        """Return a stopped writer, which still makes the stores of the publication it works on."""
+        first = min((store.publication for store in writer.stores), default=0)
+        left = tuple(store for store in writer.stores if store.publication == first)
+        return writer._replace(stores=left, is_stopped=True)
 
     def _next(self, stores: tuple[Store, ...]) -> Iterator[tuple[Store, tuple[Store, ...]]]:
         """Yield each store that may be the next to take effect, and the others."""
@@ -320,11 +359,16 @@ class _Model:
         # The words of one copy are stored in any order.
         return earlier[-2:] != later[-2:]
 
-    def _stored(self, state: State, store: Store, epoch: int) -> State:
+    def _stored(self, state: State, store: Store, writer: Writer) -> State:
         """Return the state with a store of a writer in memory. Raises `Violation`."""
+        is_lawful = state.claim == writer.epoch
         match store.place:
             case "claim":
                 return state._replace(claim=store.value)
+            case "begun":
+                begun = list(state.begun)
+                begun[writer.epoch] = store.value
+                return state._replace(begun=tuple(begun))
             case "slot":
                 words = list(state.slots[store.slot])
                 words[store.word] = store.value
@@ -332,28 +376,46 @@ class _Model:
                 slots[store.slot] = tuple(words)
                 epochs = list(state.epochs)
                 serial = store.value // EPOCHS
-                if set(words) == {store.value} and 0 < serial <= state.head:
+                if is_lawful and set(words) == {store.value} and 0 < serial <= state.head:
                     # A message takes the place of a forged one that was published.
-                    epochs[serial] = epoch
+                    epochs[serial] = (writer.epoch,)
                 return state._replace(slots=tuple(slots), epochs=tuple(epochs))
-        if state.claim != epoch:
+        epochs = [*state.epochs, ()][: max(len(state.epochs), store.value + 1)]
+        before = epochs[store.value]
+        if is_lawful:
+            epochs[store.value] = (*(one for one in before if one != writer.epoch), writer.epoch)
+        elif writer.is_stopped:
+            # It sets the head back, or to the serial on which its successor works.
+            words = state.slots[store.value % self._setup.depth]
+            if set(words) == {store.value * EPOCHS + state.claim}:
+                epochs[store.value] = (*before, state.claim)
+        else:
             raise Violation("a message is published without the valid claim")
-        return state._replace(head=store.value, epochs=(*state.epochs[: store.value], epoch))
+        return state._replace(head=store.value, epochs=tuple(epochs))
 
     def _begin(self, state: State) -> Iterator[tuple[str, State]]:
         """Start a successor of the last writer."""
         *_, last = state.writers
+        setup = self._setup
         is_gone = not last.is_alive and not last.buffer
-        if last.epoch > self._setup.kills or not (is_gone or not self._setup.is_locked):
+        if last.epoch > setup.kills + setup.stops:
+            return
+        if not (is_gone or last.is_stopped or not setup.is_locked):
             return
         epoch = last.epoch + 1
         stores: list[Store] = []
-        for access in self._setup.claim:
-            if access == "store claim":
-                stores.append(Store("claim", epoch))
+        section = 0
+        for number, access in enumerate(setup.claim):
+            common = {"section": section, "access": number}
+            if access == "fence":
+                section += 1
+            elif access == "store begun":
+                stores.append(Store("begun", state.head, **common))
+            elif access == "store claim":
+                stores.append(Store("claim", epoch, **common))
             elif access == "clear slot":
                 stores += [
-                    Store("slot", EMPTY, at, self._serial, access=1)
+                    Store("slot", EMPTY, at, self._serial, **common)
                     for at, words in enumerate(state.slots)
                     if words[self._serial] // EPOCHS > state.head
                 ]
@@ -375,7 +437,7 @@ class _Model:
         return state._replace(
             head=serial,
             slots=tuple(slots),
-            epochs=(*state.epochs[:serial], -1),
+            epochs=(*state.epochs[:serial], ()),
             forgeries=state.forgeries - 1,
         )
 
@@ -403,7 +465,8 @@ class _Model:
                 yield f"load word {word} of slot {reader.serial % self._setup.depth}", after
         is_whole = min(reader.copied) >= 0
         if reader.claim < 0 and (self._is_weak or (is_whole and self._is_good(reader))):
-            after = self._concluded(state, reader._replace(claim=state.claim))
+            known = reader._replace(claim=state.claim, begun=state.begun)
+            after = self._concluded(state, known)
             yield "load claim", after
         if reader.head < 0 and reader.has_head and (self._is_early or self._is_bad(reader)):
             after = self._concluded(state, reader._replace(head=state.head))
@@ -432,16 +495,24 @@ class _Model:
         """Check whether a copy is of the message sought, and whole."""
         copied = reader.copied
         serial = copied[self._serial]
-        is_whole = serial == copied[self._content] == copied[self._check]
+        check = copied[self._check]
+        is_whole = serial == copied[self._content] == check
+        if self._setup.is_bound:
+            # The checksum is combined with the epoch. Who forges a message may know the epoch.
+            epochs = {copied[self._epoch] % EPOCHS, check % EPOCHS} - {0}
+            is_whole = is_whole and len(epochs) < 2
         return serial // EPOCHS == reader.serial and (is_whole or not self._setup.is_checked)
 
     def _is_lawful(self, reader: Reader) -> bool:
+        setup = self._setup
         epoch = reader.copied[self._epoch] % EPOCHS
-        return (
-            not self._setup.is_claimed
-            or epoch in (reader.known, reader.claim)
-            or reader.known < epoch < reader.claim
-        )
+        if not setup.is_claimed or epoch == reader.claim:
+            return True
+        if epoch == reader.known and reader.claim < 0 and not setup.is_claim_loaded:
+            return True
+        if not (epoch == reader.known or reader.known < epoch) or epoch >= reader.claim:
+            return False
+        return not setup.is_bounded or reader.serial <= reader.begun[epoch + 1]
 
     def _is_bad(self, reader: Reader) -> bool:
         """Check whether the reader has seen that it cannot take its copy."""
@@ -456,7 +527,8 @@ class _Model:
         copied = reader.copied
         epoch = copied[self._epoch] % EPOCHS
         if self._is_good(reader):
-            if reader.claim < 0 and epoch != reader.known and self._setup.is_claimed:
+            is_claim_needed = self._setup.is_claim_loaded or epoch != reader.known
+            if reader.claim < 0 and is_claim_needed and self._setup.is_claimed:
                 return reader
             if self._is_lawful(reader):
                 self._check_returned(state, reader)
@@ -469,12 +541,15 @@ class _Model:
 
     def _check_returned(self, state: State, reader: Reader) -> None:
         message = reader.copied[self._content]
-        published = reader.serial * EPOCHS + state.epochs[reader.serial]
-        if message != published:
+        published = [reader.serial * EPOCHS + epoch for epoch in state.epochs[reader.serial]]
+        if self._setup.stops:
+            published.append(reader.serial * EPOCHS + state.claim)
+        if message not in published:
             raise Violation("a reader returns a message that was not published")
         if reader.serial <= reader.last:
             raise Violation("a reader returns messages out of order")
 
     def _check_blame(self, state: State, reader: Reader) -> None:
-        if not self._setup.losses and not self._setup.forgeries:
+        setup = self._setup
+        if not setup.losses and not setup.forgeries and not setup.stops:
             raise Violation("a reader takes a published message for a bad one")

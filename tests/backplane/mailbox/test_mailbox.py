@@ -12,6 +12,7 @@ from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
 from rack.backplane.mailbox.protocols import open_reader, open_writer
 from rack.backplane.mailbox.slots import Slots, build_signature, get_epoch
 from rack.backplane.segment import Segment
+from rack.backplane.words import Box
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
@@ -166,7 +167,8 @@ def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: Ma
     write(writer, 0)
     assert seen(reader, 1) == (1, NEW)
     forger = Slots(segment, writer.spec)
-    forger.resume_writing(build_signature(get_epoch(writer.slots.signature), 4321))
+    signature = build_signature(get_epoch(writer.slots.signature), 4321)
+    forger.resume_writing(signature, forger.box[Box.HEAD])
     forger.publish_message(1, 2, 1)
     assert seen(reader, 2) == (1, OLD)
     statistics = reader.statistics

@@ -27,6 +27,15 @@ CASES: dict[str, dict[str, Any]] = {
     "two readers": {"readers": 2, "words": COARSE},
     "lost serials": {"messages": 4, "losses": 1, "words": COARSE},
     "forged messages": {"messages": 4, "forgeries": 1, "words": COARSE},
+    "a take-over": {"messages": 4, "kills": 0, "stops": 1, "words": COARSE},
+    "a take-over and a kill in it": {"messages": 3, "kills": 1, "stops": 1, "words": COARSE},
+    "two reads and a take-over": {
+        "messages": 3,
+        "kills": 0,
+        "stops": 1,
+        "reads": 2,
+        "words": COARSE,
+    },
 }
 """What may happen, by name, while five messages go through four slots."""
 NOT_PUBLISHED = "a reader returns a message that was not published"
@@ -48,12 +57,17 @@ MUTANTS: dict[str, tuple[dict[str, Any], str]] = {
     "no fence before a slot is filled": ({"memory": Memory.WEAK, "publish": PUBLISH[1:]}, NOT_BAD),
     "no fence before a copy is judged": ({"memory": Memory.WEAK, "judge": JUDGE[1:]}, NOT_BAD),
     "claim after publication": (
-        {"memory": Memory.SC, "claim": CLAIM[1:], "publish": (*PUBLISH, CLAIM[0])},
+        {
+            "memory": Memory.SC,
+            "claim": (*CLAIM[:2], CLAIM[3]),
+            "publish": (*PUBLISH, CLAIM[2]),
+        },
         NO_CLAIM,
     ),
     "claim without the kernel's lock": ({"memory": Memory.SC, "is_locked": False}, NO_CLAIM),
     "slots of a dead writer left filled": (
-        {"memory": Memory.SC, "claim": CLAIM[:1], "losses": 1},
+        # Bounds of serials protect from this too.
+        {"memory": Memory.SC, "claim": CLAIM[:3], "losses": 1, "is_bounded": False},
         NOT_PUBLISHED,
     ),
     "signature before message": (
@@ -67,6 +81,22 @@ MUTANTS: dict[str, tuple[dict[str, Any], str]] = {
     "signature loaded after the message": (
         {"memory": Memory.SC, "read": (*READ[:2], *READ[:1:-1]), "forgeries": 1},
         NOT_PUBLISHED,
+    ),
+    "message of a stopped writer accepted": (
+        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_bounded": False, "words": COARSE},
+        NOT_PUBLISHED,
+    ),
+    "checksum without the epoch": (
+        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_bound": False, "words": COARSE},
+        NOT_PUBLISHED,
+    ),
+    "claim not loaded for a known writer": (
+        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_claim_loaded": False, "words": COARSE},
+        NOT_PUBLISHED,
+    ),
+    "claim before its bound": (
+        {"memory": Memory.SC, "claim": (CLAIM[2], *CLAIM[1:2], CLAIM[0], CLAIM[3])},
+        NOT_BAD,
     ),
     "reader waits for a slot being filled": ({"memory": Memory.SC, "waits": True}, WAITS),
 }

@@ -22,7 +22,11 @@ from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.backplane.mailbox.model import CLAIM, JUDGE, LOSE, PUBLISH, READ
 
-WORDS = {Box.HEAD: "head", Box.CLAIMANT: "claim"}
+WORDS = {
+    Box.HEAD: "head",
+    Box.CLAIMANT: "claim",
+    **dict.fromkeys(range(Box.BEGUN, Box.BEGUN + Box.EPOCHS), "begun"),
+}
 
 
 class RecordedBox:
@@ -130,7 +134,7 @@ def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...
 EXPECTED = {
     "publish": PUBLISH,
     "lose": LOSE,
-    "first read": (*READ, "load claim"),
+    "first read": READ,
     "read": READ,
     "judge": JUDGE,
     "claim": CLAIM,
@@ -185,9 +189,9 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     ),
     "claim after publication": (
         Writer,
-        "claim_mailbox",
-        "box[Box.CLAIMANT] = self",
-        "self",
+        "_begin_epoch",
+        "box[Box.CLAIMANT] = signature",
+        "signature",
     ),
 }
 """Mistakes in the code, as the model knows them: class, method, its text and another one."""
@@ -265,7 +269,8 @@ def compile_all(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]
         function._machine = machine
 
 
-MACHINE_CODE = {name: EXPECTED[name] for name in ("publish", "read")}
+# The claim is a plain load after the check. test_compiled_mailbox.py shows that it counts.
+MACHINE_CODE = {"publish": PUBLISH, "read": READ[:-1]}
 
 
 @pytest.mark.slow

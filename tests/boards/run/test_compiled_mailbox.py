@@ -125,7 +125,7 @@ class End:
     def forge(self, ahead: int, pid: int = STRANGER) -> None:
         """Publish in the writer's place, as another process."""
         slots = Slots(self.segment, self.segment.layout.find_mailbox(NAME))
-        slots.resume_writing(build_signature(slots.box[Box.EPOCH], pid))
+        slots.resume_writing(build_signature(slots.box[Box.EPOCH], pid), slots.box[Box.HEAD])
         slots.publish_message(self.tick, self.tick + ahead, self.tick)
 
     def lose_writer(self, is_lost: bool) -> None:

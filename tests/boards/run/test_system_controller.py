@@ -53,6 +53,7 @@ def wiring(**changed: object) -> ClockWiring:
         "on_loss": {"left": Demand.STOP, "right": Demand.BRAKE},
         "reservation": None,
         "schedulings": {},
+        "copy": None,
     }
     return ClockWiring(**{**plain, **changed})  # type: ignore[arg-type]  # by name, as above
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.command import CommandConfig
+from rack.boards.config.schema import RackConfig
 from rack.tools.console.tables import render_text
 from rack.tools.lab.benches.observed import record_rack
 from rack.tools.timing.operator_response import OperatorResponse, measure_response, plot_response

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rack.boards.config.schema import CommandConfig
+from rack.boards.config.command import CommandConfig
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import render_text
 from rack.tools.lab.reproduction.experiments.experiment import ChartedRecord, Experiment, Workshop

@@ -1,0 +1,189 @@
+"""A standby takes over a mailbox whose writer is dead, stopped or late: one writer at any time, and
+no reader gets a message of the one before."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import pytest
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
+from rack.backplane.mailbox.protocols import open_reader, open_standby_writer, open_writer
+from rack.backplane.words import Box
+from tests.backplane.bus import NAME, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, exit_status, fork
+
+NEW, OLD = Verdict.NEW, Verdict.OLD
+
+
+def write(writer: Writer, tick: int, what: int) -> None:
+    writer.message.row[:] = what
+    writer.write(tick)
+
+
+def read(reader: Reader, tick: int) -> tuple[int, Verdict]:
+    reading = reader.read(tick)
+    row = reading.message.row
+    assert (row == row[0]).all(), "half a message"
+    return int(row[0]), reading.verdict
+
+
+@pytest.mark.parametrize("has_died", [True, False])
+def test_a_standby_continues_after_the_newest_message(make_bus: MakeBus, has_died: bool) -> None:
+    segment = make_bus(mailbox(depth=4))
+    writer, standby = open_writer(segment, NAME), open_standby_writer(segment, NAME)
+    reader = open_reader(segment, NAME)
+    write(writer, 0, 1)
+    assert read(reader, 1) == (1, NEW)
+    if has_died:
+        writer.close()
+    standby.take_over()
+    assert standby.is_locked == has_died
+    assert (standby.holds_claim, writer.holds_claim) == (True, False)
+    write(standby, 1, 2)
+    assert read(reader, 2) == (2, NEW)
+    if not has_died:
+        writer.release_claim()
+        assert standby.try_lock()
+
+
+def test_two_runs_with_and_without_a_hand_over_have_equal_chains(make_bus: MakeBus) -> None:
+    segment = make_bus(mailbox(depth=4))
+    writer = open_writer(segment, NAME)
+    chains = []
+    for is_handed_over in (False, True):
+        writer.slots.serial = writer.slots.chain = segment.get_box(NAME)[Box.HEAD] = 0
+        write(writer, 0, 1)
+        if is_handed_over:
+            writer = open_standby_writer(segment, NAME)
+            writer.take_over()
+        write(writer, 1, 2)
+        chains.append(writer.slots.chain)
+    assert chains[0] == chains[1]
+
+
+@pytest.mark.parametrize("serials", [0, 1, 3, 6])
+@pytest.mark.parametrize("knows", [True, False], ids=["known writer", "unknown writer"])
+def test_what_a_stopped_writer_still_stores_is_never_accepted(
+    make_bus: MakeBus, serials: int, knows: bool
+) -> None:
+    segment = make_bus(mailbox(depth=4))
+    writer, standby = open_writer(segment, NAME), open_standby_writer(segment, NAME)
+    reader, ring = open_reader(segment, NAME), MailboxRing(segment, NAME)
+    write(writer, 0, 1)
+    if knows:
+        assert read(reader, 1) == (1, NEW)
+    standby.take_over()
+    for serial in range(serials):
+        write(standby, 1 + serial, 10 + serial)
+    # It was stopped just before it published its second message.
+    write(writer, 1, 99)
+    last = serials
+    found, _ = read(reader, last + 2)
+    assert found != 99
+    rows = ring.read_new_rows().rows
+    assert 99 not in {int(row["message"]["row"][0]) for row in rows}
+    # The next message of the standby repairs the head, and is read.
+    write(standby, last + 2, 50)
+    assert read(reader, last + 3) == (50, NEW)
+    assert reader.statistics.corrupt == 0
+
+
+class Bomb:
+    """Kills this process at an access to shared memory, by its number."""
+
+    def __init__(self, number: int) -> None:
+        self.left = number
+
+    def count(self) -> None:
+        if not self.left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.left -= 1
+
+
+class MinedBox:
+    """Words of the head of a mailbox, each store of which counts."""
+
+    def __init__(self, words: memoryview, bomb: Bomb) -> None:
+        self._words, self._bomb = words, bomb
+
+    def __getitem__(self, at: Any) -> Any:
+        return self._words[at]
+
+    def __setitem__(self, at: int, value: int) -> None:
+        self._bomb.count()
+        self._words[at] = value
+
+
+class MinedSlot:
+    """A slot into which every word is stored alone, in an order of the bomb's choice."""
+
+    def __init__(self, place: memoryview, bomb: Bomb) -> None:
+        self._place, self._bomb = place, bomb
+
+    def __getitem__(self, part: slice) -> memoryview:
+        return self._place[part]
+
+    def __setitem__(self, part: slice, content: Any) -> None:
+        view = self._place[part]
+        for at in range(0, len(view), 8):
+            self._bomb.count()
+            view[at : at + 8] = content[at : at + 8]
+
+
+def mine(writer: Writer, bomb: Bomb) -> None:
+    """Let every store of a writer to shared memory count."""
+    slots: Any = writer.slots
+    slots.box = MinedBox(slots.box, bomb)
+    writer._claimed = MinedBox(writer._claimed, bomb)  # type: ignore[assignment]
+    slots.places = [MinedSlot(place, bomb) for place in slots.places]
+    slots.heads = [MinedBox(words, bomb) for words in slots.heads]
+
+
+MOST_STORES = 100
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("is_stopped", [False, True], ids=["dead", "stopped"])
+def test_a_kill_at_any_store_between_claim_and_publication_leaves_a_whole_mailbox(
+    make_bus: MakeBus, is_stopped: bool
+) -> None:
+    """The third copy continues, whatever the second has done; the first may store once more."""
+    names = [f"writer.point{number}" for number in range(MOST_STORES)]
+    segment = make_bus(*(mailbox(depth=4, name=name) for name in names))
+    survived = False
+    for number, name in enumerate(names):
+        first = open_writer(segment, name)
+        reader = open_reader(segment, name)
+        write(first, 0, 1)
+        assert read(reader, 1) == (1, NEW)
+        if not is_stopped:
+            first.close()
+        second = open_standby_writer(segment, name)
+
+        def take_over(second: Writer = second, number: int = number) -> None:
+            mine(second, Bomb(number))
+            second.take_over()
+            write(second, 1, 2)
+
+        survived = exit_status(fork(take_over)) == 0
+        second.close()
+        assert read(reader, 2) in ((1, OLD), (2, NEW))
+        third = open_standby_writer(segment, name)
+        third.take_over()
+        if is_stopped:
+            write(first, 1, 99)
+        write(third, 2, 3)
+        assert read(reader, 3) == (3, NEW), number
+        assert reader.statistics.corrupt == 0
+        assert third.slots.signature == segment.get_box(name)[Box.CLAIMANT], "one writer"
+        third.close()
+        first.close()
+        if survived:
+            break
+    assert survived
+    assert number > 20

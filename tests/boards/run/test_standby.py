@@ -1,0 +1,296 @@
+"""A standby takes over the mailboxes of its task: in lockstep without any difference in what is
+written, in real time with at most one message missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rack.backplane.mailbox.history import MailboxRing
+from rack.backplane.segment import Segment
+from rack.backplane.standby import ReplicatedTask, list_standbys
+from rack.backplane.trace import open_trace_ring
+from rack.backplane.words import Block, System
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from tests.boards.conftest import PLAIN, PLANNED, UNJUDGED, MakeConfig
+from tests.boards.runs import end_of, faulty, kill
+from tests.processes import BOUND_S, RACK, wait_until
+
+STANDBY = "board.wave.standby={slot=9,core=0}"
+TWO = "board.wave.standby=[{slot=9,core=0},{slot=10,core=1}]"
+SOON = "supervision.lockstep_restart_s=0.05"
+MANY = "supervision.restarts=1000"
+SECONDS = 0.5
+STRAYS_AT = 420
+LONG_S = 1.25
+MISSING = 1
+"""Number of messages that a reader may miss in a hand-over in real time."""
+
+
+def hang(board: str, tick: int) -> dict[str, Any]:
+    return {"kind": "hang", "board": board, "tick": tick}
+
+
+def overload(board: str, tick: int) -> dict[str, Any]:
+    """Return a fault that makes cycles take 1.5 times their period."""
+    return {"kind": "overrun", "board": board, "tick": tick, "cycles": 3, "by": 1.5}
+
+
+def run(config: RackConfig, seconds: float = SECONDS) -> tuple[str, ReplicatedTask, list[str]]:
+    """Run a rack in lockstep. Returns its digest, its replicated task, and its alarms' codes."""
+    with Rack(config) as rack:
+        outcome = rack.run(seconds)
+        (task,) = list_standbys(rack.segment)
+        found = [event.code for event in rack.events if event.kind == "detection"]
+    return outcome.digest, task, found
+
+
+def digest_of(config: RackConfig, seconds: float = SECONDS) -> str:
+    with Rack(config) as rack:
+        return rack.run(seconds).digest
+
+
+def read_ticks(segment: Segment, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the release ticks and the epochs of all messages that readers accept."""
+    rows = MailboxRing(segment, name).read_new_rows().rows
+    return rows["tick"], rows["epoch"] & 0xFFFFFFFF
+
+
+CASES: Mapping[str, tuple[str, tuple[Mapping[str, Any], ...], str, str, int]] = {
+    "none": (STANDBY, (), "wave", "none", 0),
+    "killed": (STANDBY, (kill("wave", 30),), "wave.standby", "lost", 1),
+    "killed standby": (STANDBY, (kill("wave.standby", 30),), "wave", "none", 0),
+    "killed twice": (
+        STANDBY,
+        (kill("wave", 30), kill("wave.standby", 80)),
+        "wave",
+        "lost",
+        2,
+    ),
+    "hanging": (STANDBY, (hang("wave", 30),), "wave.standby", "stopped", 1),
+    "late": (STANDBY, (overload("wave", 30),), "wave.standby", "late", 1),
+    "two of three killed": (
+        TWO,
+        (kill("wave", 30), kill("wave.standby", 32)),
+        "wave.standby2",
+        "lost",
+        2,
+    ),
+}
+"""Standbys, faults, then the active copy at the end, the last reason and number of hand-overs."""
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Digest of the rack without standbys and faults."""
+    path = tmp_path_factory.mktemp("plain") / "waves.toml"
+    path.write_text(PLANNED)
+    return digest_of(load(str(path), [f"name=test-plain-{os.getpid()}"]))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_in_lockstep_nobody_can_tell_which_copy_has_written(
+    case: str, config: MakeConfig, plain: str
+) -> None:
+    standby, faults, active, reason, count = CASES[case]
+    struck = faulty(config(standby, SOON, UNJUDGED, text=PLANNED), *faults)
+    digest, task, alarms = run(struck)
+    assert (task.active.name, task.reason, task.hand_overs) == (active, reason, count)
+    assert digest == plain
+    assert set(alarms) <= {"hang", "late"}
+    assert [copy.name for copy in task.copies if copy.is_active] == [active]
+    assert all(copy.aligned_since is not None for copy in task.copies if not copy.is_active)
+
+
+@pytest.mark.slow
+def test_a_kill_from_outside_at_any_moment_leaves_the_digest(
+    config: MakeConfig, plain: str
+) -> None:
+    with Rack(config(STANDBY, SOON, UNJUDGED, MANY, text=PLANNED)) as rack:
+        words = rack.segment.words
+        rack.start(SECONDS)
+        for number, tick in enumerate((20, 70, 120), start=1):
+            wait_until(lambda tick=tick: not rack.watch(0.0) or words[System.TICK] > tick)
+            (task,) = list_standbys(rack.segment)
+            if any(copy.is_lost for copy in task.copies):
+                continue  # on a fast machine the run was ahead of the last restart
+            os.kill(task.active.pid, signal.SIGKILL)
+            wait_until(
+                lambda number=number: (
+                    not rack.watch(0.0) or list_standbys(rack.segment)[0].hand_overs >= number
+                )
+            )
+        outcome = end_of(rack)
+        (task,) = list_standbys(rack.segment)
+    assert task.hand_overs >= 1
+    assert outcome.digest == plain
+
+
+@pytest.mark.alone
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill", "stop"])
+def test_in_real_time_readers_miss_at_most_one_message(
+    config: MakeConfig, number: signal.Signals
+) -> None:
+    slow = ("clock.mode=realtime", "clock.speed=0.01", UNJUDGED, MANY)
+    with Rack(config(STANDBY, *slow, text=PLANNED)) as rack:
+        words = rack.segment.words
+        rack.start(0.05)
+        wait_until(lambda: not rack.watch(0.0) or words[System.TICK] >= 6)
+        (before,) = list_standbys(rack.segment)
+        os.kill(before.active.pid, number)
+        wait_until(
+            lambda: (
+                not rack.watch(0.0) or list_standbys(rack.segment)[0].hand_overs > before.hand_overs
+            )
+        )
+        (after,) = list_standbys(rack.segment)
+        if number == signal.SIGSTOP:
+            # It may store what it was about to, which no reader accepts.
+            os.kill(before.active.pid, signal.SIGCONT)
+        end_of(rack)
+        ticks, epochs = read_ticks(rack.segment, "wave.status")
+    assert after.active.name != before.active.name
+    assert after.reason in ("lost", "stopped", "late")
+    assert np.diff(ticks).min() >= 1
+    around = (ticks >= 4) & (ticks <= after.since_tick + 3)
+    assert np.diff(ticks[around]).max() <= 1 + MISSING
+    assert (np.diff(epochs) >= 0).all()
+    assert epochs[-1] > epochs[0]
+
+
+def test_the_words_of_a_copy_are_those_of_its_process(config: MakeConfig) -> None:
+    with Rack(config(STANDBY)) as rack:
+        (task,) = list_standbys(rack.segment)
+        pids = [rack.segment.get_block(copy.name)[Block.PID] for copy in task.copies]
+    assert [copy.pid for copy in task.copies] == pids
+    assert [(copy.name, copy.slot) for copy in task.copies] == [("wave", 2), ("wave.standby", 9)]
+
+
+CLOCK = "clock.standby={slot=9,core=0}"
+
+
+def clock_ticks(rack: Rack) -> np.ndarray:
+    """Return the release ticks of the wave's cycles, as its trace has them."""
+    return open_trace_ring(rack.segment, "wave").read_new_rows().rows["tick"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill", "stop"])
+def test_the_standby_of_the_clock_gives_every_tick_once(
+    config: MakeConfig, plain: str, number: signal.Signals
+) -> None:
+    with Rack(config(CLOCK, UNJUDGED, MANY, text=PLANNED)) as rack:
+        words = rack.segment.words
+        rack.start(SECONDS)
+        wait_until(lambda: words[System.TICK] > 20)
+        first = words[System.CLOCK_PID]
+        os.kill(first, number)
+        wait_until(lambda: not rack.watch(0.0) or words[System.CLOCK_PID] != first)
+        outcome = end_of(rack)
+        ticks = clock_ticks(rack)
+        ends = [event.text for event in rack.events if event.kind == "died"]
+    assert outcome.cause == "time over"
+    assert ends == ["board 'clock' ended: signal SIGKILL"]
+    assert outcome.digest == plain
+    assert (np.diff(ticks) == 1).all()
+
+
+@pytest.mark.alone
+@pytest.mark.slow
+def test_in_real_time_the_standby_of_the_clock_continues_its_grid(config: MakeConfig) -> None:
+    slow = ("clock.mode=realtime", "clock.speed=0.01", UNJUDGED, MANY)
+    with Rack(config(CLOCK, *slow, text=PLANNED)) as rack:
+        words = rack.segment.words
+        rack.start(0.05)
+        wait_until(lambda: not rack.watch(0.0) or words[System.TICK] >= 6)
+        first, epoch_ns = words[System.CLOCK_PID], words[System.EPOCH_NS]
+        os.kill(first, signal.SIGKILL)
+        outcome = end_of(rack)
+        ticks = clock_ticks(rack)
+        assert words[System.CLOCK_PID] != first
+        assert words[System.EPOCH_NS] == epoch_ns
+    assert outcome.cause == "time over"
+    around = ticks[(ticks >= 4) & (ticks <= 12)]
+    assert np.diff(around).min() >= 1
+    assert np.diff(around).max() <= 1 + 2
+
+
+def run_straying(
+    config: MakeConfig, file: Path, copy: str, *settings: str
+) -> tuple[ReplicatedTask, list[Event]]:
+    """Run a rack in which one copy computes wrong messages from `STRAYS_AT` on."""
+    text = PLAIN.replace("wave_levels:Wave", "wave_levels:Straying")
+    params = f'board.wave.params={{at={STRAYS_AT},strays="{file}"}}'
+    with Rack(config(params, SOON, UNJUDGED, *settings, text=text)) as rack:
+        file.write_text(str(rack.segment.get_block(copy)[Block.PID]))
+        rack.run(LONG_S)
+        (task,) = list_standbys(rack.segment)
+        return task, list(rack.events)
+
+
+@pytest.mark.parametrize("copy", ["wave", "wave.standby"])
+def test_copies_that_differ_are_noticed_one_cycle_later(
+    config: MakeConfig, tmp_path: Path, copy: str
+) -> None:
+    file = tmp_path / "pid"
+    task, events = run_straying(config, file, copy, STANDBY, "board.wave.compare=true")
+    (found,) = (event for event in events if event.code == "differs")
+    assert (found.tick, found.subject, found.board) == (
+        STRAYS_AT + 1,
+        "wave.status",
+        "wave.standby",
+    )
+    assert found.text == "'wave.status': a standby computes another value"
+    assert task.hand_overs == 0
+
+
+@pytest.mark.parametrize(
+    ("copy", "active", "reason"),
+    [
+        ("wave", "wave.standby", "strayed"),
+        ("wave.standby", "wave", "none"),
+        ("wave.standby2", "wave", "none"),
+    ],
+)
+def test_the_copy_that_two_others_outvote_is_taken_out_and_restarted(
+    config: MakeConfig, tmp_path: Path, copy: str, active: str, reason: str
+) -> None:
+    task, events = run_straying(config, tmp_path / "pid", copy, TWO, "board.wave.vote=true")
+    (found,) = (event for event in events if event.code == "strayed")
+    assert (found.tick, found.subject) == (STRAYS_AT + 2, copy)
+    assert (task.active.name, task.reason) == (active, reason)
+    (died,) = (event for event in events if event.code == "died")
+    (rejoined,) = (event for event in events if event.code == "rejoined")
+    assert (died.board, rejoined.board) == (copy, copy)
+    assert all(one.aligned_since is not None for one in task.copies if not one.is_active)
+
+
+def test_a_level_that_is_not_deterministic_cannot_be_compared(
+    config: MakeConfig, tmp_path: Path
+) -> None:
+    text = PLAIN.replace("wave_levels:Wave", "wave_levels:Lottery")
+    path = tmp_path / "lottery.toml"
+    path.write_text(config(STANDBY, "board.wave.compare=true", text=text).to_toml_text())
+    done = subprocess.run(
+        [*RACK, "run", str(path), "--seconds", "0.5", "--no-record"],
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S * 5,
+        check=False,
+    )
+    line = (
+        "board.wave.compare = true: the level is not deterministic: 'wave.status': a standby"
+        " computes another value, at the start"
+    )
+    assert (done.returncode, line in done.stderr) == (2, True), done.stderr
+    assert "Traceback" not in done.stderr
