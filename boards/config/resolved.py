@@ -320,9 +320,7 @@ class Examination:
         of_host = self._wiring.host_side_mailboxes
         from_host = self._wiring.mailboxes_from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
-        scheduling = (
-            build_scheduling(self._config, spec.board, spec.every) if is_executor else None
-        )
+        scheduling = build_scheduling(self._config, spec.board, spec.every) if is_executor else None
         budget_ns = round((board.busy_ms if is_executor else board.planning_ms) * 1e6)
         return TaskWiring(
             task=ports.task,
