@@ -77,11 +77,8 @@ def test_a_malformed_endpoint_is_one_line(tmp_path: Path, endpoint: str, why: st
 
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
-    (line,) = mistakes(tmp_path, TLS)
-    assert line == (
-        "adapter.lan.certificates: missing; TLS needs certificates: see rack lan certificates"
-        " --help"
-    )
+    why = "missing; TLS needs certificates: see rack lan certificates --help"
+    assert mistakes(tmp_path, TLS) == [f"adapter.lan.certificates: {why}"]
 
 
 def test_flaws_of_all_certificate_files_are_reported_with_the_other_mistakes(
@@ -107,10 +104,7 @@ def test_certificates_are_found_next_to_the_config_from_anywhere(
     assert load_text(config.to_toml_text()) == config
     os.chdir(tmp_path)
     (line,) = mistakes(tmp_path, TLS.replace("127.0.0.1", "127.0.0.2"), 'certificates = "certs"')
-    assert (
-        "cell.pem: the certificate is not valid for address 127.0.0.2; valid addresses: 127.0.0.1"
-        in line
-    )
+    assert "not valid for address 127.0.0.2; valid addresses: 127.0.0.1" in line
 
 
 def test_exports_over_tls_need_named_peers(tmp_path: Path) -> None:
@@ -140,29 +134,18 @@ def test_a_launch_warns_of_certificates_that_expire_soon(tmp_path: Path) -> None
 def test_a_launch_without_tls_reports_possible_attacks(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
-    read = "read messages, and pretend that racks come and go"
-    for listen, lan, note in (
-        (
-            near,
-            "insecure = true",
-            f"no TLS: whoever reaches {near} can read and forge messages",
-        ),
-        (near, own, f"no TLS: whoever reaches {near} can {read}"),
+    forge, read = "read and forge messages", "read messages, and pretend that racks come and go"
+    for listen, lan, could in (
+        (near, "insecure = true", forge),
+        (near, own, read),
         ("unix/cell", "", ""),
         (TLS, own, ""),
-        (
-            far,
-            "insecure = true",
-            f"no TLS: whoever reaches {far} can read and forge messages",
-        ),
-        (
-            far,
-            f"insecure = true\n{own}",
-            f"no TLS: whoever reaches {far} can {read}",
-        ),
+        (far, "insecure = true", forge),
+        (far, f"insecure = true\n{own}", read),
     ):
         assert mistakes(tmp_path, listen, lan) == []
-        assert list_network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
+        notes = [f"no TLS: whoever reaches {listen} can {could}"] if could else []
+        assert list_network_notes(load(tmp_path / "rack.toml")) == notes
 
 
 def test_remote_stops_are_refused_on_endpoints_that_allow_impersonation(tmp_path: Path) -> None:
