@@ -45,57 +45,60 @@ def test_a_valid_command_has_no_mistakes(
     assert mistakes(nasrem, level, what, **more) == []
 
 
+Command = tuple[str, str, dict[str, Any]]
 ONE_OF = "goto of 'task' takes one of: joints|pose|direction|home"
 NO_LENGTH = "all zero; its length must not be zero"
-MISTAKES: list[tuple[str, str, dict[str, Any], str]] = [
+MISTAKES: list[tuple[Command, str]] = [
     (
-        *("nobody", "hold", {}),
+        ("nobody", "hold", {}),
         'level = "nobody": no level of this name takes commands; levels that do: servo, primitive,'
         " elemental_move, task",
     ),
     (
-        *("primitive", "goto", {"home": True}),
+        ("primitive", "goto", {"home": True}),
         "what = \"goto\": 'primitive' does not take goto; it takes: hold, resume",
     ),
-    ("task", "hold", {"home": True}, "home: hold takes no goal; remove it"),
-    ("task", "goto", {}, f"goal: missing; {ONE_OF}"),
+    (("task", "hold", {"home": True}), "home: hold takes no goal; remove it"),
+    (("task", "goto", {}), f"goal: missing; {ONE_OF}"),
     (
-        *("task", "goto", {"home": True, **PLACE}),
+        ("task", "goto", {"home": True, **PLACE}),
         f"goal: several given: direction|home; {ONE_OF}",
     ),
     (
-        *("servo", "setpoint", PLACE),
+        ("servo", "setpoint", PLACE),
         "position: not a goal for setpoint of 'servo'; valid goals: joints",
     ),
-    ("task", "goto", TURNED, "position: missing; tool position, m"),
+    (("task", "goto", TURNED), "position: missing; tool position, m"),
     (
-        *("task", "goto", {**PLACE, **ALONG, **TURNED}),
+        ("task", "goto", {**PLACE, **ALONG, **TURNED}),
         "direction = [0.0, 0.0, 1.0]: quaternion is also given; give only one of quaternion,"
         " direction",
     ),
-    ("task", "goto", {**PLACE, "direction": [0.0] * 3}, f"direction = {[0.0] * 3}: {NO_LENGTH}"),
-    ("task", "goto", {**PLACE, "quaternion": [0.0] * 4}, f"quaternion = {[0.0] * 4}: {NO_LENGTH}"),
+    (("task", "goto", {**PLACE, "direction": [0.0] * 3}), f"direction = {[0.0] * 3}: {NO_LENGTH}"),
     (
-        *("servo", "setpoint", {"joints": HOME[:5]}),
+        ("task", "goto", {**PLACE, "quaternion": [0.0] * 4}),
+        f"quaternion = {[0.0] * 4}: {NO_LENGTH}",
+    ),
+    (
+        ("servo", "setpoint", {"joints": HOME[:5]}),
         f"joints = {HOME[:5]}: 5 values; must be 6, one per joint: j1, j2, j3, j4, j5, j6",
     ),
     (
-        *("servo", "setpoint", {"joints": [9.0, *HOME[1:]]}),
+        ("servo", "setpoint", {"joints": [9.0, *HOME[1:]]}),
         "joints = 9.0: out of range; joint 'j1' must be -2.78753 to 2.78753 rad",
     ),
     (
-        *("task", "hold", {"tick": 4, "at": 1.0}),
+        ("task", "hold", {"tick": 4, "at": 1.0}),
         "at = 1.0: tick is also given; give only one of tick, at",
     ),
-    ("task", "hold", {"name": "x"}, 'name = "x": hold takes no name; remove it'),
-    ("servo", "modify", {"name": "x", "on": True}, "name = \"x\": modify of 'servo' knows: none"),
+    (("task", "hold", {"name": "x"}), 'name = "x": hold takes no name; remove it'),
+    (("servo", "modify", {"name": "x", "on": True}), "name = \"x\": modify of 'servo' knows: none"),
 ]
 
 
-@pytest.mark.parametrize(("level", "what", "more", "line"), MISTAKES)
-def test_a_mistake_is_one_line(
-    nasrem: RackConfig, level: str, what: str, more: dict[str, Any], line: str
-) -> None:
+@pytest.mark.parametrize(("command", "line"), MISTAKES)
+def test_a_mistake_is_one_line(nasrem: RackConfig, command: Command, line: str) -> None:
+    level, what, more = command
     assert mistakes(nasrem, level, what, **more) == [line]
 
 

@@ -36,13 +36,8 @@ def test_a_schedule_that_does_not_divide_is_one_mistake(setting: str, line: str)
 
 
 def test_a_rate_is_refused_with_the_nearest_rates() -> None:
-    config = load(
-        "nasrem",
-        [
-            "schedule={ minor_ms = 2.5, major_ms = 1000 }",
-            "board.primitive.rate_hz=57.142857142857146",
-        ],
-    )
+    rate = "board.primitive.rate_hz=57.142857142857146"
+    config = load("nasrem", ["schedule={ minor_ms = 2.5, major_ms = 1000 }", rate])
     (found,) = check_schedule(Wiring(config))
     assert found.place == "board.primitive.rate_hz"
     assert found.why.startswith("a cycle of 17.5 ms does not fit the schedule")
