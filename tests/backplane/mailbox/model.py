@@ -14,9 +14,10 @@ permit, and loads are speculated. Copies access their words in any order under a
 one for all: a store becomes visible to all others at once, as on x86-64 and ARMv8. What a dead
 writer has stored is visible before its successor begins, which gets the kernel's lock from it.
 
-`PUBLISH`, `LOSE`, `CLAIM`, `READ` and `JUDGE` are the accesses of the code, in order; test_model.py
-compares them with those that the code makes. A reader chooses any message that it may find visible;
-so the model covers reads by ticks, of the newest message, and those that step back.
+`PUBLISH`, `LOSE`, `CLAIM`, `READ` and `JUDGE` are the accesses of the code, in order;
+tests/boards/run/test_access_order.py compares them with those that the code makes. A reader chooses
+any message that it may find visible; so the model covers reads by ticks, of the newest message, and
+those that step back.
 """
 
 from __future__ import annotations
@@ -48,52 +49,31 @@ class Memory(Enum):
 
 @dataclass(frozen=True)
 class Setup:
-    """Bounds and variants of the exploration.
-
-    Attributes:
-        memory: Order of accesses.
-        depth: Slots of the ring.
-        published: Messages that exist at the beginning.
-        messages: Maximum number of messages published after that.
-        kills: Maximum number of times that the writer is killed.
-        losses: Maximum number of serials published without a message.
-        forgeries: Maximum number of messages published by a process without the claim. Each is
-            published at once, and not while the writer publishes.
-        readers: Number of readers.
-        reads: Reads of each reader.
-        words: Words of a slot: e, epoch of the writer; s, serial; p, content; c, checksum.
-            Words of one group are copied together.
-        publish: Accesses of a writer that publishes a message.
-        lose: Accesses of a writer that publishes a serial without its message.
-        claim: Accesses of a writer that begins.
-        read: Accesses of a reader that takes a message. If it does not know the writer yet, it
-            loads the claim, too.
-        judge: Accesses of a reader after a bad copy.
-        is_checked: True if a reader checks the checksum.
-        is_claimed: True if a reader checks the writer.
-        is_locked: True if a writer begins only after its predecessor is dead.
-        waits: True if a reader waits while its slot is being filled.
-    """
+    """Bounds and variants of the exploration."""
 
     memory: Memory
-    depth: int = 4
-    published: int = 3
-    messages: int = 5
-    kills: int = 1
-    losses: int = 0
+    depth: int = 4  # slots of the ring
+    published: int = 3  # messages that exist at the beginning
+    messages: int = 5  # most that are published after that
+    kills: int = 1  # most times that the writer is killed
+    losses: int = 0  # most serials that are published without a message
     forgeries: int = 0
+    """Most messages published by a process without the claim: each at once, and not while the
+    writer publishes."""
     readers: int = 1
-    reads: int = 1
+    reads: int = 1  # of each reader
     words: tuple[str, ...] = (SIGNATURE, "s", "p", "c")
+    """Words of a slot: e, epoch of the writer; s, serial; p, content; c, checksum. Words of one
+    group are copied together."""
     publish: tuple[str, ...] = PUBLISH
     lose: tuple[str, ...] = LOSE
-    claim: tuple[str, ...] = CLAIM
-    read: tuple[str, ...] = READ
-    judge: tuple[str, ...] = JUDGE
-    is_checked: bool = True
-    is_claimed: bool = True
-    is_locked: bool = True
-    waits: bool = False
+    claim: tuple[str, ...] = CLAIM  # of a writer that begins
+    read: tuple[str, ...] = READ  # and of the claim, if the reader does not know the writer yet
+    judge: tuple[str, ...] = JUDGE  # after a bad copy
+    is_checked: bool = True  # a reader checks the checksum
+    is_claimed: bool = True  # a reader checks the writer
+    is_locked: bool = True  # a writer begins only after its predecessor is dead
+    waits: bool = False  # a reader waits while its slot is being filled
 
 
 class Store(NamedTuple):
