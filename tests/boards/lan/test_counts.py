@@ -26,47 +26,40 @@ def tracker() -> tuple[SequenceTracker, LanImport]:
 NEW, OLD, AGAIN = "new", "disordered", "repeated"
 
 
-@pytest.mark.parametrize(
-    ("resumed", "messages", "missing"),
-    [
-        pytest.param(
-            (7, 20), [(20, 0, AGAIN), (19, 0, AGAIN), (23, 0, NEW)], 2, id="a reader restarts"
-        ),
-        pytest.param((0, 20), [(20, 0, AGAIN), (21, 0, NEW)], 0, id="with no launch known"),
-        pytest.param(
-            (), [(20, 60, NEW), (20, 64, NEW), (21, 65, NEW)], 0, id="a restarted sender's number"
-        ),
-        pytest.param(
-            (),
-            [(1, 0, NEW), (WINDOW_MESSAGES * 4, 0, NEW), (2, 0, OLD), (2, 0, OLD)],
-            WINDOW_MESSAGES * 4 - 2,
-            id="older than the window",
-        ),
-        # The third has not come, the second has.
-        pytest.param(
-            (),
-            [(2, 0, NEW), (4, 0, NEW), (5, 0, NEW), (5, 16, NEW), (3, 0, OLD), (2, 0, AGAIN)],
-            1,
-            id="a number used twice changes no other count",
-        ),
-        pytest.param(
-            (),
-            [(18, 54, NEW), (20, 60, NEW), (20, 64, NEW), (19, 57, OLD)],
-            1,
-            id="a number used twice hides no missing one",
-        ),
-        pytest.param(
-            (),
-            [(18, 54, NEW), (20, 60, NEW), (20, 59, AGAIN), (21, 58, AGAIN)],
-            1,
-            id="an old write under the newest number",
-        ),
-    ],
-)
+CASES: dict[str, tuple[tuple[int, ...], list[tuple[int, int, str]], int]] = {
+    "a reader restarts": ((7, 20), [(20, 0, AGAIN), (19, 0, AGAIN), (23, 0, NEW)], 2),
+    "with no launch known": ((0, 20), [(20, 0, AGAIN), (21, 0, NEW)], 0),
+    "a restarted sender's number": ((), [(20, 60, NEW), (20, 64, NEW), (21, 65, NEW)], 0),
+    "older than the window": (
+        (),
+        [(1, 0, NEW), (WINDOW_MESSAGES * 4, 0, NEW), (2, 0, OLD), (2, 0, OLD)],
+        WINDOW_MESSAGES * 4 - 2,
+    ),
+    # The third has not come, the second has.
+    "a number used twice changes no other count": (
+        (),
+        [(2, 0, NEW), (4, 0, NEW), (5, 0, NEW), (5, 16, NEW), (3, 0, OLD), (2, 0, AGAIN)],
+        1,
+    ),
+    "a number used twice hides no missing one": (
+        (),
+        [(18, 54, NEW), (20, 60, NEW), (20, 64, NEW), (19, 57, OLD)],
+        1,
+    ),
+    "an old write under the newest number": (
+        (),
+        [(18, 54, NEW), (20, 60, NEW), (20, 59, AGAIN), (21, 58, AGAIN)],
+        1,
+    ),
+}
+"""Launch and number that a resumed reader knows; messages as number, serial (0: that of their
+number) and what each counts as; how many are missing."""
+
+
+@pytest.mark.parametrize(("resumed", "messages", "missing"), CASES.values(), ids=CASES)
 def test_each_message_is_counted_as_what_it_is(
     resumed: tuple[int, ...], messages: list[tuple[int, int, str]], missing: int
 ) -> None:
-    """`resumed`: launch and number known; messages: number, serial, and what it counts as."""
     found, count = tracker()
     if resumed:
         count.launch, count.number = resumed
