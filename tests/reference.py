@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rack.boards.config import load
-from rack.boards.config.reference import KeyTable, find_tables, list_key_tables
+from rack.boards.config.reference import KeyTable, list_key_tables
 
 PAGE = Path(__file__).parents[1] / "configs" / "REFERENCE.md"
 HEAD = """# All keys of a config
@@ -25,13 +25,6 @@ Made by `make reference` from the models that check a config, with the levels of
 def page() -> str:
     """Return the page."""
     return "\n".join([HEAD, *_lines()])
-
-
-def is_on_page(name: str) -> bool:
-    """Say whether the page has the tables whose names begin with this one as they are now."""
-    text = PAGE.read_text()
-    tables = find_tables(name, load("nasrem"))
-    return bool(tables) and all("\n".join(_table(table)) in text for table in tables)
 
 
 def _lines() -> Iterator[str]:

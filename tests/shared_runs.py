@@ -39,6 +39,14 @@ def nasrem_run(factory: pytest.TempPathFactory) -> Path:
     return _copy(factory, "nasrem", NASREM_S, ("clock.mode=lockstep",))
 
 
+def faulty_run(factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a run in lockstep of the small rack in which its upper board hangs at tick
+    80, and another fault finds no cause to begin."""
+    hang = '{ kind = "hang", board = "upper", tick = 80 }'
+    idle = '{ kind = "hang", board = "lower", when = "upper.status.state == error", for = "20ms" }'
+    return _copy(factory, "faulty", 3.0, [f"fault=[{hang}, {idle}]"])
+
+
 def _copy(
     factory: pytest.TempPathFactory, name: str, seconds: float, settings: Sequence[str] = ()
 ) -> Path:

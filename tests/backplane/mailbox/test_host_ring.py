@@ -15,12 +15,18 @@ from tests.backplane.conftest import MakeBus
 from tests.boards.host_programs import Number
 
 CAPACITY = 5
+Ends = tuple[HostWriter, HostReader]
 
 
 @pytest.fixture
 def segment(make_bus: MakeBus) -> Segment:
     """A bus with one ring of `CAPACITY` messages in 8 slots."""
     return make_bus(mailbox("queue", capacity=CAPACITY))
+
+
+@pytest.fixture
+def ends(segment: Segment) -> Ends:
+    return HostWriter(segment, NAME), HostReader(segment, NAME)
 
 
 def send(writer: HostWriter, number: int) -> bool:
@@ -37,15 +43,11 @@ def taken(reader: HostReader) -> list[int | None]:
     return found
 
 
-def test_messages_come_once_and_in_order(segment: Segment) -> None:
-    writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
+def test_messages_come_once_and_in_order(ends: Ends, segment: Segment) -> None:
+    writer, reader = ends
     assert [send(writer, number) for number in (1, 2, 3)] == [True] * 3
-    assert (reader.waiting_count, taken(reader), reader.waiting_count, reader.written_tick) == (
-        3,
-        [1, 2, 3],
-        0,
-        3,
-    )
+    assert reader.waiting_count == 3
+    assert (taken(reader), reader.waiting_count, reader.written_tick) == ([1, 2, 3], 0, 3)
     for number in (4, 5, 6):
         send(writer, number)
     reader.take_oldest()
@@ -53,8 +55,8 @@ def test_messages_come_once_and_in_order(segment: Segment) -> None:
     assert taken(HostReader(segment, NAME)) == [5, 6]
 
 
-def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(segment: Segment) -> None:
-    writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
+def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(ends: Ends) -> None:
+    writer, reader = ends
     sent = [send(writer, number) for number in range(1, 9)]
     assert sent == [True] * CAPACITY + [False] * 3
     assert (reader.full_count, reader.waiting_count) == (3, CAPACITY)
@@ -63,8 +65,8 @@ def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(segment: Segmen
     assert taken(reader) == [2, 3, 4, 5, 9]
 
 
-def test_the_newest_message_supersedes_the_others(segment: Segment) -> None:
-    writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
+def test_the_newest_message_supersedes_the_others(ends: Ends) -> None:
+    writer, reader = ends
     for number in (1, 2, 3):
         send(writer, number)
     message = reader.take_newest(most=8)
@@ -73,18 +75,16 @@ def test_the_newest_message_supersedes_the_others(segment: Segment) -> None:
     assert reader.take_newest(most=8) is None
 
 
-def test_a_damaged_message_is_refused_and_the_next_one_is_not(segment: Segment) -> None:
-    writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
+def test_a_damaged_message_is_refused_and_the_next_one_is_not(ends: Ends, segment: Segment) -> None:
+    writer, reader = ends
     for number in (1, 2, 3):
         send(writer, number)
     segment.bytes[message_address(segment, 2)] ^= 1
     assert (taken(reader), reader.refused) == ([1, None, 3], 1)
 
 
-def test_messages_overwritten_by_an_unbounded_writer_are_counted(
-    segment: Segment,
-) -> None:
-    writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
+def test_messages_overwritten_by_an_unbounded_writer_are_counted(ends: Ends) -> None:
+    writer, reader = ends
     for number in range(1, 21):
         writer.message.id = number
         writer.write(tick=number)

@@ -66,13 +66,11 @@ class Board:
     def send(self, tick: int, *senders: str, now: int | None = None) -> bool:
         """Write a message of each of these senders, of all by default; say whether all were in
         time."""
-        in_time = [self._send(name, tick, now) for name in senders or SENDERS]
+        in_time = []
+        for writer in (self.writers[name] for name in senders or SENDERS):
+            writer.message.id, writer.message.row = tick, tick
+            in_time.append(writer.write(tick, now))
         return all(in_time)
-
-    def _send(self, name: str, tick: int, now: int | None) -> bool:
-        message = self.writers[name].message
-        message.id, message.row = tick, tick
-        return self.writers[name].write(tick, now)
 
     def read(self, tick: int) -> dict[str, int]:
         """Read every mailbox; return the ids of the new messages by sender."""
@@ -101,20 +99,9 @@ def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: Make
     # Sent 0.5 ms after the second tick that follows the release, and visible from the third on.
     segment = make_bus(*boxes(every=4, sent_ns=2 * CLOCK_NS + 500_000), *tasks())
     writer = InterruptWriter(segment, "first.point")
-    assert [writer.is_in_time(8, now) for now in (None, 8, 10, 11, 12)] == [
-        True,
-        True,
-        True,
-        False,
-        False,
-    ]
-    assert [writer.compute_visible_tick(8, now) for now in (None, 8, 10, 11, 12)] == [
-        11,
-        11,
-        11,
-        12,
-        13,
-    ]
+    for now, visible in ((None, 11), (8, 11), (10, 11), (11, 12), (12, 13)):
+        assert writer.is_in_time(8, now) is (visible == 11)
+        assert writer.compute_visible_tick(8, now) == visible
 
 
 def test_a_message_served_across_a_release_is_visible_at_the_next(make_bus: MakeBus) -> None:
@@ -133,11 +120,8 @@ def test_a_full_inbox_loses_the_last_messages_at_this_board_only(make_bus: MakeB
     for tick in range(5):
         board.send(tick)
         assert board.read(tick + 1) == {"third": tick, "second": tick}
-    assert {name.partition(".")[0]: line.lost for name, line in board.inbox.lines.items()} == {
-        "first": 5,
-        "second": 0,
-        "third": 0,
-    }
+    lost = {name.partition(".")[0]: line.lost for name, line in board.inbox.lines.items()}
+    assert lost == {"first": 5, "second": 0, "third": 0}
     # An observer of the host side reads by ticks, without the inbox.
     assert Reader(board.segment, "first.point").read(5).message.id == 4
 

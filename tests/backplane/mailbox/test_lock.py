@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
@@ -13,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.semaphores import get_lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
+from tests.processes import BOUND_S, FORKS, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 REPORT = 200
@@ -28,15 +30,19 @@ def bus(make_bus: MakeBus) -> Segment:
 
 
 def hold(segment: Segment) -> None:
-    """Take the lock and keep it."""
     assert MailboxLock(segment, NAME, BOUND_S).acquire()
     segment.words[REPORT] = WON
     time.sleep(60)
 
 
-def obtains(lock: MailboxLock) -> bool:
-    """Check whether a lock can be obtained within a few of its bounds."""
-    return any(lock.acquire() for _ in range(3))
+@contextmanager
+def crew(work: Callable[[Segment, int], None], bus: Segment, count: int) -> Iterator[list[int]]:
+    """Run so many workers, and kill them at the end; yield the words of their reports."""
+    reports = list(range(REPORT + 1, REPORT + 1 + count))
+    with ExitStack() as stack:
+        for word in reports:
+            stack.enter_context(forked(lambda word=word: work(bus, word)))
+        yield reports
 
 
 def test_an_access_that_times_out_is_a_bus_error(bus: Segment) -> None:
@@ -62,9 +68,8 @@ def test_an_access_that_times_out_is_a_bus_error(bus: Segment) -> None:
 
 def test_a_read_delayed_by_a_dead_holder_is_counted_once(bus: Segment) -> None:
     reader = open_reader(bus, NAME)
-    holder = fork(lambda: hold(bus))
-    wait_until(lambda: bus.words[REPORT])
-    kill(holder)
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[REPORT])
     for _ in range(3):
         reader.read(0)
     assert (reader.statistics.held_up, reader.statistics.bad_reads) == (1, 1)
@@ -84,19 +89,14 @@ def compete(segment: Segment, word: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", range(6))
 def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, trial: int) -> None:
-    reports = [REPORT + 1, REPORT + 2, REPORT + 3]
-    holder = fork(lambda: hold(bus))
-    waiters = [fork(lambda word=word: compete(bus, word)) for word in reports]
-    try:
+    with forked(lambda: hold(bus)) as holder, crew(compete, bus, 3) as reports:
         wait_until(lambda: bus.words[REPORT] and all(bus.words[word] for word in reports))
         kill(holder)
         bus.words[REPORT - 1] = 1
         wait_until(lambda: all(bus.words[word] > 0 for word in reports))
         assert sorted(bus.words[word] for word in reports) == [WON, LOST, LOST]
-    finally:
-        for pid in (holder, *waiters):
-            kill(pid)
-    assert obtains(MailboxLock(bus, NAME))
+    lock = MailboxLock(bus, NAME)
+    assert any(lock.acquire() for _ in range(3))
 
 
 def cycle(segment: Segment, word: int = REPORT) -> None:
@@ -114,17 +114,12 @@ def cycle(segment: Segment, word: int = REPORT) -> None:
 
 
 def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
-    reports = [REPORT + 1, REPORT + 2, REPORT + 3]
-    workers = [fork(lambda word=word: cycle(bus, word)) for word in reports]
-    try:
+    with crew(cycle, bus, 3) as reports:
         wait_until(lambda: all(bus.words[word] > 3_000 for word in reports))
         # While this process has the lock nobody counts. On a busy machine a waiter whose time is up
         # may get in first.
         wait_until(MailboxLock(bus, NAME, BOUND_S).acquire)
         counted = bus.words[COUNT]
-    finally:
-        for pid in workers:
-            kill(pid)
     # A worker reports its count after the critical section.
     assert 0 <= counted - sum(bus.words[word] for word in reports) <= len(reports)
 
@@ -133,22 +128,14 @@ def test_only_one_process_is_in_the_critical_section(bus: Segment) -> None:
 @pytest.mark.parametrize("bystanders", [0, 2])
 def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystanders: int) -> None:
     rng, lock = random.Random(3), MailboxLock(bus, NAME)
-    others = [
-        fork(lambda word=word: cycle(bus, word))
-        for word in range(REPORT + 1, REPORT + 1 + bystanders)
-    ]
-    try:
+    with crew(cycle, bus, bystanders):
         for _ in range(15):
             bus.words[REPORT] = 0
-            victim = fork(lambda: cycle(bus))
-            wait_until(lambda: bus.words[REPORT])
-            time.sleep(rng.uniform(0.0, 0.001))
-            kill(victim)
+            with forked(lambda: cycle(bus)):
+                wait_until(lambda: bus.words[REPORT])
+                time.sleep(rng.uniform(0.0, 0.001))
             wait_until(lock.acquire)
             lock.release()
-    finally:
-        for pid in others:
-            kill(pid)
 
 
 def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment) -> None:

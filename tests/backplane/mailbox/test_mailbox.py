@@ -59,19 +59,14 @@ def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(
     visible, tick = [], phase
     for _ in range(16):
         # Written at `now`: often before its slice ends, sometimes well after.
-        now = tick + rng.choice(
-            (0, 1, spec.delay - 1, spec.delay, spec.delay + rng.randrange(3 * every))
-        )
+        late = spec.delay + rng.randrange(3 * every)
+        now = tick + rng.choice((0, 1, spec.delay - 1, spec.delay, late))
         in_time = now < tick + spec.delay
         assert write(writer, tick, now) == in_time
         # By counting: the end of its slice or, once that has come, the next tick on the writer's
         # grid.
-        due = (
-            tick + spec.delay
-            if in_time
-            else next(t for t in range(now + 1, now + 99) if (t - phase) % every == 0)
-        )
-        visible.append(due)
+        on_grid = (t for t in range(now + 1, now + 99) if (t - phase) % every == 0)
+        visible.append(tick + spec.delay if in_time else next(on_grid))
         # A late writer takes the newest release.
         tick = max(tick + every * within, now - (now - phase) % every)
     for at in range(visible[-1] + 1):
@@ -145,16 +140,14 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBu
     segment = make_bus(mailbox())
     writer = open_writer(segment, NAME)
 
-    def second(pid: int) -> bool:
-        with pytest.raises(
-            MailboxError, match=f"'{NAME}' already has a writer \\(process {pid}\\)"
-        ):
+    def second() -> bool:
+        first = rf"'{NAME}' already has a writer \(process {segment.launcher}\)"
+        with pytest.raises(MailboxError, match=first):
             open_writer(segment, NAME)
         return True
 
-    pid = segment.launcher
-    assert second(pid)
-    assert exit_status(fork(lambda: second(pid))) == 0
+    assert second()
+    assert exit_status(fork(second)) == 0
     writer.close()
     # A claim ends with its process.
     assert exit_status(fork(lambda: write(open_writer(segment, NAME), 0))) == 0

@@ -10,14 +10,14 @@ import pytest
 from xxhash import xxh3_64_intdigest
 
 from rack.backplane.layout import PROTOCOLS, TICK_PROTOCOLS, Protocol
-from rack.backplane.mailbox.mailbox import Reader, Verdict
+from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
 from rack.backplane.mailbox.slots import CHECKED_FROM, Slots, get_epoch
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import get_lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
+from tests.processes import BOUND_S, FORKS, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 READS = 10_000
@@ -25,15 +25,17 @@ KILLS = 8
 AT_ONCE: tuple[Protocol, ...] = ("double-buffer", "lock")
 
 
+def write_next(writer: Writer) -> None:
+    # A write that the lock cut off has no serial.
+    writer.message.id = writer.message.row[:] = writer.serial + 1
+    writer.write(writer.serial + 1)
+
+
 def hammer(segment: Segment) -> None:
     """Write for ever; every element of a message holds its serial."""
     writer = open_writer(segment, NAME)
     while True:
-        # A write that the lock cut off has no serial.
-        serial = writer.serial + 1
-        writer.message.id = serial
-        writer.message.row[:] = serial
-        writer.write(serial)
+        write_next(writer)
 
 
 def is_whole(reader: Reader) -> bool:
@@ -99,18 +101,16 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(
     reader, slots = open_reader(segment, NAME), Slots(segment, segment.layout.find_mailbox(NAME))
     rng, latest = random.Random(7), np.iinfo(np.int64).max
     for _ in range(KILLS):
-        writer, known = fork(lambda: hammer(segment)), reader.serial
-        wait_until(lambda: reader.peek().has_message and reader.serial > known)  # noqa: B023  called before the next turn
-        time.sleep(rng.uniform(0.0, 0.002))
-        kill(writer)
+        known = reader.serial
+        with forked(lambda: hammer(segment)):
+            wait_until(lambda: reader.peek().has_message and reader.serial > known)  # noqa: B023  called before the next turn
+            time.sleep(rng.uniform(0.0, 0.002))
         assert reader.read(latest).has_message
         assert reader.serial == slots.box[0]
         assert is_whole(reader)
         successor = open_writer(segment, NAME)
         assert successor.serial == reader.serial
-        successor.message.id = successor.serial + 1
-        successor.message.row[:] = successor.serial + 1
-        successor.write(successor.serial + 1)
+        write_next(successor)
         successor.close()
         assert follows(slots, reader.serial + 1)
         assert reader.read(latest).is_new

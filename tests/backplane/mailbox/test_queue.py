@@ -28,12 +28,14 @@ def ends(segment: Segment) -> tuple[QueueWriter, QueueReader]:
     return writer, reader
 
 
+def queue_message(writer: QueueWriter, serial: int) -> bool:
+    writer.message.id, writer.message.row = serial, serial
+    return writer.send()
+
+
 def send(writer: QueueWriter, tick: int, *serials: int, now: int | None = None) -> list[bool]:
     """Send these messages in the cycle of a tick, and write them; return the verdicts."""
-    verdicts = []
-    for serial in serials:
-        writer.message.id, writer.message.row = serial, serial
-        verdicts.append(writer.send())
+    verdicts = [queue_message(writer, serial) for serial in serials]
     writer.write(tick, now)
     return verdicts
 
@@ -61,16 +63,8 @@ def test_several_messages_of_a_cycle_are_read_in_order(make_bus: MakeBus) -> Non
 def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(*queue(8)))
     send(writer, 0, 1, 2, 3, 4)
-    assert [
-        ids(reader.take_messages(tick, most))
-        for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))
-    ] == [
-        [],
-        [1],
-        [2, 3],
-        [],
-        [4],
-    ]
+    for tick, most, taken in ((1, 0, []), (2, 1, [1]), (3, 2, [2, 3]), (4, -1, []), (5, 9, [4])):
+        assert ids(reader.take_messages(tick, most)) == taken
 
 
 def test_a_full_queue_refuses_messages_and_keeps_the_unread_ones(make_bus: MakeBus) -> None:
@@ -96,8 +90,7 @@ def test_messages_of_a_cycle_are_published_together_or_not_at_all(make_bus: Make
         assert isinstance(writer, QueueWriter)
         send(writer, 0, 1, 2)
         for serial in (3, 4):
-            writer.message.id, writer.message.row = serial, serial
-            writer.send()
+            queue_message(writer, serial)
         for _ in writer.iterate_outgoing():
             # Killed before they are shown.
             writer.publish_message(1, 2, 1)
@@ -115,8 +108,7 @@ def test_a_late_write_becomes_visible_at_the_next_boundary(
 ) -> None:
     writer, reader = ends(make_bus(*queue(4, rates=(4, 1))))
     assert writer.write(4, now)  # nothing to write is never late
-    writer.message.id, writer.message.row = 1, 1
-    assert writer.send()
+    assert queue_message(writer, 1)
     assert writer.write(4, now) is in_time
     assert [ids(reader.read(tick)) for tick in (7, 8, 12)] == [[], [1][:in_time], [1][in_time:]]
 
@@ -190,11 +182,8 @@ def bookkeeping(segment: Segment) -> Iterator[int]:
         for serial in serials:
             message = message_address(segment, serial, name)
             # The position is part of its message.
-            size = (
-                SLOT_HEAD_SIZE
-                if name == NAME
-                else compute_slot_stride(segment.layout.find_mailbox(name))
-            )
+            stride = compute_slot_stride(segment.layout.find_mailbox(name))
+            size = SLOT_HEAD_SIZE if name == NAME else stride
             yield from range(message - SLOT_HEAD_SIZE, message - SLOT_HEAD_SIZE + size)
 
 

@@ -13,6 +13,7 @@ from rack.boards.config.published import gather_facts
 from rack.levels.operator import Goal, Operation
 
 HOME = [0.1 * k for k in range(6)]
+GOTO = {"level": "task", "what": "goto", "position": [0.4, 0.1, 0.3]}
 
 
 @pytest.fixture(scope="module")
@@ -33,35 +34,24 @@ def message_of(config: RackConfig, **given: object) -> tuple[Message, int]:
 
 def test_a_joint_goal_has_a_position_for_every_joint(nasrem: RackConfig) -> None:
     message, tick = message_of(nasrem, level="servo", what="setpoint", joints=HOME, tick=40)
-    assert (message.what, message.goal, message.count, tick) == (
-        Operation.SETPOINT,
-        Goal.JOINTS,
-        6,
-        40,
-    )
+    assert (message.what, message.goal) == (Operation.SETPOINT, Goal.JOINTS)
+    assert (message.count, tick) == (6, 40)
     assert message.joints[:6].tolist() == pytest.approx(HOME)
     assert not message.joints[6:].any()
     assert not message.position.any()
 
 
 def test_a_position_goal_points_down_by_default(nasrem: RackConfig) -> None:
-    given = {"level": "task", "what": "goto", "position": [0.4, 0.1, 0.3]}
-    message, tick = message_of(nasrem, **given, at=1.0)
+    message, tick = message_of(nasrem, **GOTO, at=1.0)
     assert (message.goal, message.count, tick) == (Goal.DIRECTION, 0, 400)
     assert message.position.tolist() == [0.4, 0.1, 0.3]
     assert tuple(message.direction) == DOWN
-    message, _ = message_of(nasrem, **given, direction=[1.0, 0.0, 0.0])
+    message, _ = message_of(nasrem, **GOTO, direction=[1.0, 0.0, 0.0])
     assert message.direction.tolist() == [1.0, 0.0, 0.0]
 
 
 def test_a_quaternion_is_normalised(nasrem: RackConfig) -> None:
-    message, _ = message_of(
-        nasrem,
-        level="task",
-        what="goto",
-        position=[0.4, 0.1, 0.3],
-        quaternion=[0.0, 3.0, 0.0, 4.0],
-    )
+    message, _ = message_of(nasrem, **GOTO, quaternion=[0.0, 3.0, 0.0, 4.0])
     assert message.goal == Goal.POSE
     assert message.quaternion.tolist() == pytest.approx([0.0, 0.6, 0.0, 0.8])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +14,9 @@ from rack.boards.config import CONFIGS, list_names, load, load_text
 from rack.boards.config.files import assemble, list_level_classes
 from rack.boards.config.resolved import list_class_names
 from rack.boards.errors import ConfigError
+from tests.boards.config.mistakes import find_lines, find_mistake
 
 Write = Callable[[str, str], Path]
-
-
-def lines(error: pytest.ExceptionInfo[ConfigError]) -> list[str]:
-    return str(error.value).splitlines()
 
 
 @pytest.mark.parametrize("name", list_names())
@@ -65,9 +63,7 @@ def test_other_racks_in_the_folder_of_a_bundled_one_have_names_too(
 
 
 def test_an_unknown_name_gets_the_nearest_known_one() -> None:
-    with pytest.raises(ConfigError) as error:
-        load("nasrm")
-    assert lines(error) == ["config = \"nasrm\": no such file; did you mean 'nasrem'?"]
+    assert find_mistake("nasrm") == "config = \"nasrm\": no such file; did you mean 'nasrem'?"
 
 
 def test_the_format_of_a_file_does_not_depend_on_the_files_it_extends(
@@ -86,10 +82,7 @@ def test_the_format_of_a_file_does_not_depend_on_the_files_it_extends(
 
 @pytest.mark.parametrize("given", ["0", "3", "2.0", "'2'", "true"])
 def test_no_other_format_is_read(small: Path, given: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, [f"format={given}"])
-    (line,) = lines(error)
-    assert line.startswith("format = ")
+    assert find_mistake(small, f"format={given}").startswith("format = ")
 
 
 def test_bases_are_merged_in_order(small: Path, write: Write) -> None:
@@ -110,41 +103,32 @@ def test_an_arm_is_replaced_as_a_whole(write: Write) -> None:
 
 
 def test_a_robot_table_without_a_model_is_merged_like_any_table(write: Write) -> None:
-    config = load(
-        write(
-            "mine.toml", 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'
-        )
-    )
-    whole = load("nasrem")
+    text = 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'
+    config, whole = load(write("mine.toml", text)), load("nasrem")
     assert config.robot == whole.robot.model_copy(update={"substeps": 8})
     assert config.scene == whole.scene.model_copy(update={"clearance": 0.03})
 
 
 def test_an_incomplete_arm_is_reported_to_inherit_nothing(write: Write) -> None:
     model = write("arm.xml", "<mujoco/>")
-    with pytest.raises(ConfigError) as error:
-        load(write("mine.toml", f'extends = ["nasrem"]\n[robot]\nmodel = "{model.name}"\n'))
-    alone = (
-        "a [robot] with its own model is a different arm and inherits nothing from extended files"
-    )
-    assert f"robot.jerk: missing; jerk limits of planned motion [rad/s3]; {alone}" in lines(error)
+    mine = write("mine.toml", f'extends = ["nasrem"]\n[robot]\nmodel = "{model.name}"\n')
+    (line,) = [line for line in find_lines(mine) if line.startswith("robot.jerk: missing; ")]
+    assert "a [robot] with its own model is a different arm and inherits nothing from" in line
 
 
-DEEP = {
-    "lists": "[task]\nx = " + "[" * 5000 + "]" * 5000,
-    "dotted keys": "[task]\n" + ".".join(["a"] * 3000) + " = 1",
-    "just too deep": "[task]\nx = " + "[" * 31 + "]" * 31,
-}
-
-
-@pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
-def test_endless_nesting_is_refused_in_one_line(write: Write, text: str) -> None:
-    with pytest.raises(
-        ConfigError, match=r"^deep\.toml.*: nested too deeply: the limit is 32 levels$"
-    ) as error:
-        load(write("deep.toml", f'extends = ["fig2"]\n{text}\n'))
-    assert len(lines(error)) == 1
-    assert len(lines(error)[0]) < 200
+@pytest.mark.parametrize(
+    "line",
+    [
+        "x = " + "[" * 5000 + "]" * 5000,
+        ".".join(["a"] * 3000) + " = 1",
+        "x = " + "[" * 31 + "]" * 31,
+    ],
+    ids=["lists", "dotted keys", "just too deep"],
+)
+def test_endless_nesting_is_refused_in_one_line(write: Write, line: str) -> None:
+    found = find_mistake(write("deep.toml", f'extends = ["fig2"]\n[task]\n{line}\n'))
+    assert re.fullmatch(r"deep\.toml.*: nested too deeply: the limit is 32 levels", found)
+    assert len(found) < 200
 
 
 VALUES = {
@@ -167,11 +151,10 @@ def test_values_that_no_config_may_have_are_refused_in_files_and_settings(
 def test_an_endless_chain_of_files_is_refused(write: Write) -> None:
     for at in range(40):
         write(f"chain{at}.toml", f'extends = ["chain{at + 1}.toml"]\n')
-    with pytest.raises(
-        ConfigError,
-        match=r"chain32.toml: extends: the chain of extended files is longer than 32 files$",
-    ):
-        load(write("chain40.toml", "").with_name("chain0.toml"))
+    found = find_mistake(write("chain40.toml", "").with_name("chain0.toml"))
+    assert found.endswith(
+        "chain32.toml: extends: the chain of extended files is longer than 32 files"
+    )
 
 
 def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None:
@@ -191,38 +174,29 @@ def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
     (device := tmp_path / "device.toml").symlink_to("/dev/zero")
     for path, kind in ((fifo, "FIFO"), (device.resolve(), "character device")):
         why = f"{path}: cannot be read: not a regular file, but a {kind}"
-        for named in (
-            lambda path=path: load(path),
-            lambda path=path: load(small, faults=path),
-            lambda path=path: load(write("mine.toml", f'extends = ["{path}"]\n')),
-        ):
-            with pytest.raises(ConfigError) as error:
-                named()
-            assert lines(error) == [why]
+        extending = write("mine.toml", f'extends = ["{path}"]\n')
+        for config, faults in ((path, None), (small, path), (extending, None)):
+            assert find_lines(config, faults=faults) == [why]
 
 
 @pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a/" * 3000, "a\0b.toml"])
 def test_an_impossible_file_name_is_reported_as_missing(
     small: Path, write: Write, name: str
 ) -> None:
-    with pytest.raises(
-        ConfigError, match=r"^config = .*: no such file; valid are a path or one of the names "
-    ) as error:
-        load(name)
-    assert len(lines(error)[0]) - len(", ".join(list_names())) < 160, (
-        "it is cut, apart from the names of racks"
-    )
-    with pytest.raises(ConfigError, match=r"^--faults = .*: no such file"):
-        load(small, faults=name)
+    found = find_mistake(name)
+    assert re.match(r"config = .*: no such file; valid are a path or one of the names ", found)
+    assert len(found) - len(", ".join(list_names())) < 160, "it is cut, apart from names of racks"
+    (found,) = find_lines(small, faults=name)
+    assert re.match(r"--faults = .*: no such file", found)
     if "\0" not in name:
-        with pytest.raises(ConfigError, match=r"extends = .*: no such file"):
-            load(write("mine.toml", f'extends = ["{name}"]\n'))
+        found = find_mistake(write("mine.toml", f'extends = ["{name}"]\n'))
+        assert re.search(r"extends = .*: no such file", found)
 
 
 def test_a_config_that_extends_itself_is_refused(write: Write) -> None:
     write("a.toml", 'extends = ["b.toml"]')
-    with pytest.raises(ConfigError, match=r"extends itself: b.toml -> a.toml -> b.toml"):
-        load(write("b.toml", 'extends = ["a.toml"]'))
+    found = find_lines(write("b.toml", 'extends = ["a.toml"]'))
+    assert "extends itself: b.toml -> a.toml -> b.toml" in found[0]
 
 
 @pytest.mark.parametrize(
@@ -247,9 +221,7 @@ def test_an_override_reaches_into_a_list(small: Path) -> None:
 
 
 def test_every_impossible_override_is_reported(small: Path) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, ["clock", "name.low=1", ".=2"])
-    assert lines(error) == [
+    assert find_lines(small, "clock", "name.low=1", ".=2") == [
         '--set = "clock": must be key=value, as in clock.speed=2',
         '--set = "name.low=1": "low" cannot be set in "small", which is not a table',
         '--set = ".=2": must be key=value, as in clock.speed=2',

@@ -13,8 +13,6 @@ from rack.boards.config import resolved as resolved
 from rack.boards.config.layout import find_core
 from rack.boards.config.rules import apply_rules
 
-SIZES = {"joints": 6, "bodies": 3, "state": 120}
-
 
 def test_mailboxes_have_one_writer_and_the_readers_that_the_levels_name(small: Path) -> None:
     layout = resolve_layout(load(small))
@@ -75,22 +73,11 @@ def test_a_launch_resolves_and_checks_everything_once(
     assert (clock.stop_tick, clock.linger, clock.silent, clock.history) == (4000, 200, 12_000, 400)
 
 
-POLLING = (
-    "board.lower.wake=poll",
-    "board.lower.core=1",
-    "board.lower.coupling=loose",
-    "board.lower.planner_slot=9",
-    "board.lower.planner_core=0",
-)
-
-
 def test_a_board_may_override_the_racks_wake_and_a_planner_never_polls(small: Path) -> None:
-    found = resolve(load(small, ["clock.wake=signal", *POLLING]))
-    assert {task.name: task.wake for task in found.layout.tasks} == {
-        "upper": "signal",
-        "lower": "poll",
-        "lower.planner": "timer",
-    }
+    polling = ("wake=poll", "core=1", "coupling=loose", "planner_slot=9", "planner_core=0")
+    settings = ["clock.wake=signal", *(f"board.lower.{setting}" for setting in polling)]
+    wakes = {task.name: task.wake for task in resolve(load(small, settings)).layout.tasks}
+    assert wakes == {"upper": "signal", "lower": "poll", "lower.planner": "timer"}
 
 
 def test_a_queue_has_room_for_unread_messages_and_a_late_recorder() -> None:
@@ -103,10 +90,5 @@ def test_a_queue_has_room_for_unread_messages_and_a_late_recorder() -> None:
     # Two seconds of the reader's cycles.
     assert sizes["bridge.requests_taken"] == (0, 128)
     slow = resolve_layout(load("penn", ["protocol.depth={ 'bridge.requests' = 4 }"]))
-    assert (
-        slow.find_mailbox("bridge.requests").capacity,
-        slow.find_mailbox("bridge.requests").depth,
-    ) == (
-        4,
-        256,
-    )
+    requests = slow.find_mailbox("bridge.requests")
+    assert (requests.capacity, requests.depth) == (4, 256)

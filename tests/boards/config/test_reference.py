@@ -23,37 +23,16 @@ UNITS = {
     *("1/N", "N/(m s)", "kg m2"),
 }
 DIMENSIONLESS = {
-    *(
-        "speed",
-        "small_share",
-        "lockstep_load",
-        "max_missed_fraction",
-        "phase",
-        "damping",
-        "braking",
-        "tolerance",
-        "bring_up",
-        "ratio",
-    ),  # ratios
+    *("speed", "small_share", "lockstep_load", "max_missed_fraction", "phase"),  # ratios
+    *("damping", "braking", "tolerance", "bring_up", "ratio"),
     *("quaternion", "direction", "x", "z"),
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
     *("lead", "posture", "reserve"),  # of hands: parts and factors
     "for",  # s, or text with its unit
 }
 WHOLE = (
-    *(
-        "reads",
-        "planner_reads",
-        "mailbox",
-        "depth",
-        "tables",
-        "arms",
-        "permit",
-        "posture",
-        "points",
-        "wires",
-    ),
-    *("wrench", "guard", "speed"),
+    *("reads", "planner_reads", "mailbox", "depth", "tables", "arms", "permit", "posture"),
+    *("points", "wires", "wrench", "guard", "speed"),
 )
 """Keys whose tables hold names of the user's own."""
 

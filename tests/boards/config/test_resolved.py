@@ -15,17 +15,10 @@ from tests.boards.conftest import MakeConfig
 def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     plan = resolve(config("supervision.lockstep_restart_s=0.25"))
     clock = plan.build_clock_wiring(0.5)
+    fast = resolve(config("clock.mode=realtime", "clock.speed=2")).build_clock_wiring(None)
     # A tick of 2.5 ms.
-    assert (
-        resolve(config("clock.mode=realtime", "clock.speed=2")).build_clock_wiring(None).period_ns
-        == 1_250_000
-    )
-    assert (clock.period_ns, clock.stop_tick, clock.restart_ticks, clock.linger) == (
-        2_500_000,
-        200,
-        100,
-        200,
-    )
+    assert (clock.period_ns, fast.period_ns) == (2_500_000, 1_250_000)
+    assert (clock.stop_tick, clock.restart_ticks, clock.linger) == (200, 100, 200)
     assert (clock.lockstep, clock.keeps_awake, clock.ends_run) == (True, False, "watch.status")
     assert set(clock.on_loss) == {"wave", "watch"}
     assert all(isinstance(demand, Demand) for demand in clock.on_loss.values())
@@ -64,18 +57,13 @@ def test_a_planner_runs_at_its_executors_priority_while_it_may_hold_a_lock(
 ) -> None:
     priorities = ["board.lower.priority=50", "board.upper.priority=40"]
     plan = resolve(load(small, ["clock.mode=realtime", *priorities, *settings]))
-    assert {task.task: task.critical_priority for task in plan.tasks} == {
-        "upper": 0,
-        "lower": 0,
-        "lower.planner": expected,
-    }
+    found = {task.task: task.critical_priority for task in plan.tasks}
+    assert found == {"upper": 0, "lower": 0, "lower.planner": expected}
     # The fastest executor looks after the clock.
     assert [task.task for task in plan.tasks if task.guards_clock] == ["lower"]
 
 
-def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_yields(
-    small: Path,
-) -> None:
+def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_that_yields(small: Path) -> None:
     cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]
 
     def core(*settings: str) -> int:
@@ -85,9 +73,5 @@ def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_yields(
     assert core("clock.mode=realtime") == 0
     # As fast, and in a lower slot; one that polls keeps its core.
     assert core("board.upper.rate_hz=400") == 0
-    apart = [
-        "board.lower.coupling=loose",
-        "board.lower.planner_slot=7",
-        "board.lower.planner_core=0",
-    ]
-    assert core("board.lower.wake=poll", *apart) == 0
+    apart = "wake=poll", "coupling=loose", "planner_slot=7", "planner_core=0"
+    assert core(*(f"board.lower.{setting}" for setting in apart)) == 0

@@ -14,7 +14,6 @@ from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell
 
 TASKS = CONFIGS / "tasks"
-LIMITS = ("home", "velocity", "acceleration", "jerk")
 
 
 def tables_of(path: Path) -> dict[str, Any]:
@@ -22,7 +21,6 @@ def tables_of(path: Path) -> dict[str, Any]:
 
 
 POSES = [action["joints"] for action in tables_of(TASKS / "three-poses.toml")["task"]["action"]]
-RACKS = ("rccl", "chimera", "brown", "ibm", "nist-state-table", "penn")
 
 
 def test_every_form_of_the_motion_has_the_same_poses() -> None:

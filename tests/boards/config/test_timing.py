@@ -8,8 +8,8 @@ import pytest
 
 from rack.boards.config import build_rack_timing, load, load_text, read_budgets, resolve_layout
 from rack.boards.config.timing import replace_budgets
-from rack.boards.errors import ConfigError
 from rack.boards.timing.tasks import Budget, Part, Unit
+from tests.boards.config.mistakes import find_mistake
 
 MEASURED = Budget(
     read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11
@@ -18,18 +18,14 @@ WITHIN = "board.lower.budget={ process_ms = 1.5, plan_ms = 3, plan_within_ms = 2
 
 
 def test_budgets_are_whole_nanoseconds_by_board(small: Path) -> None:
-    config = load(
-        small, ["board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"]
-    )
-    assert read_budgets(config) == {
-        "lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)
-    }
+    budget = "board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"
+    lower = Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)
+    assert read_budgets(load(small, [budget])) == {"lower": lower}
 
 
 def test_plan_within_ms_is_not_part_of_the_budget(small: Path) -> None:
-    assert read_budgets(load(small, [WITHIN])) == {
-        "lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)
-    }
+    lower = Budget(process_ns=1_500_000, plan_ns=3_000_000)
+    assert read_budgets(load(small, [WITHIN])) == {"lower": lower}
 
 
 def test_budgets_written_to_a_config_are_read_back_unchanged(small: Path) -> None:
@@ -48,26 +44,17 @@ def test_budgets_written_to_a_config_are_read_back_unchanged(small: Path) -> Non
 @pytest.mark.parametrize("table", ["budget", "transfer"])
 @pytest.mark.parametrize("key", ["exchange_ms", "update_ms"])
 def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, key: str) -> None:
-    with pytest.raises(
-        ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"
-    ):
-        resolve_layout(load(small, [f"board.upper.{table}.{key}=1.5"]))
-    assert resolve_layout(
-        load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"])
+    upper, lower = f"board.upper.{table}.{key}", f"board.lower.{table}.{key}"
+    assert find_mistake(small, f"{upper}=1.5").startswith(
+        f"{upper} = 1.5: the board has no planner"
     )
+    assert resolve_layout(load(small, [f"{upper}=0", f"{lower}=1.5"]))
 
 
 def test_tasks_are_on_the_cores_that_the_config_requests(small: Path) -> None:
-    settings = [
-        "core=7",
-        "coupling=loose",
-        "planner_slot=9",
-        "planner_core=11",
-        "budget.process_ms=1",
-    ]
-    config = load(
-        small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"]
-    )
+    settings = ["core=7", "coupling=loose", "planner_slot=9", "planner_core=11"]
+    settings += ["budget.process_ms=1", "budget.plan_ms=2"]
+    config = load(small, [f"board.lower.{setting}" for setting in settings])
     tasks = {task.name: task for task in build_rack_timing(config, resolve_layout(config)).tasks}
     assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
     assert tasks["lower.planner"].parts == (Part(Unit.PLAN, 2_000_000),)

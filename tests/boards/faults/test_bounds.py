@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.layout import Layout
 from rack.boards.config import resolve_layout
 from rack.boards.config.injections import build_injections
 from rack.boards.faults.kind import KINDS
@@ -26,11 +25,8 @@ CASES: dict[str, tuple[dict[str, Any], str | None, int | None]] = {
     "drop": ({"kind": "drop", "board": "wave"}, "watch", 1 + 1 + 8),
     "delay": ({"kind": "delay", "board": "wave", "by": 3}, "watch", 3 + 1 + 8),
     "corrupt": ({"kind": "corrupt", "board": "wave"}, "watch", 1 + 8),
-    "corrupt plan, visible after its slice": (
-        {"kind": "corrupt", "board": "wave.planner"},
-        "wave",
-        4 + 1,
-    ),
+    # It is visible after its slice.
+    "corrupt plan": ({"kind": "corrupt", "board": "wave.planner"}, "wave", 4 + 1),
     "clock stops": ({"kind": "clock-stop", "board": "clock"}, None, 3),
     "clock skips": ({"kind": "clock-skip", "board": "clock", "ticks": 4}, None, 4),
     # The driven board has a cycle of two ticks.
@@ -46,10 +42,9 @@ def bound(
     config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str
 ) -> int | None:
     found = rack(config, fault, settings=settings)
-    layout: Layout = resolve_layout(found)
-    return KINDS[fault["kind"]].compute_bound_ticks(
-        build_injections(found, layout)[0], layout, reader
-    )
+    layout = resolve_layout(found)
+    (injection,) = build_injections(found, layout)
+    return KINDS[fault["kind"]].compute_bound_ticks(injection, layout, reader)
 
 
 @pytest.mark.parametrize(("fault", "reader", "ticks"), CASES.values(), ids=CASES)
@@ -67,7 +62,5 @@ def test_a_slow_planner_is_detected_after_its_slice_and_one_release(config: Make
 
 def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:
     # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
-    assert (
-        bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock")
-        == 1 + 4
-    )
+    fault = {"kind": "lock-held", "board": "wave"}
+    assert bound(config, fault, None, "protocol.default=lock") == 1 + 4

@@ -30,9 +30,8 @@ def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
     parts: dict[str, object] = {}
     for kind in KINDS:
         if kind.where == "clock":
-            clock = Injection(
-                kind.number, -1, -1, 0, 0, 0, 0, None, tuple(3.0 for _ in kind.parameters)
-            )
+            parameters = (3.0,) * len(kind.parameters)
+            clock = Injection(kind.number, -1, -1, 0, 0, 0, 0, None, parameters)
             parts[kind.name] = kind.compute_bound_ticks(clock, layout)
             continue
         found: list[object] = []
@@ -44,9 +43,8 @@ def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
                 continue
             if kind.takes_mailbox and not readers:
                 continue
-            found += [
-                kind.compute_bound_ticks(injection, layout, reader) for reader in (None, *readers)
-            ]
+            for reader in (None, *readers):
+                found.append(kind.compute_bound_ticks(injection, layout, reader))
             found += [kind.compute_recovery_ticks(board, layout, restart) for restart in RESTARTS_S]
         parts[kind.name] = found
     parts["last reads"] = [compute_last_read_ticks((box.name,), layout) for box in layout.mailboxes]

@@ -4,7 +4,6 @@ under way."""
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from typing import Any
 
@@ -23,7 +22,7 @@ from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
+from tests.processes import FORKS, forked, in_thread, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
@@ -46,8 +45,6 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
             segment.get_block("writer")[Block.DONE] = tick
             get_done_semaphore(segment, "writer").release()
 
-    thread = threading.Thread(target=serve, daemon=True)
-    thread.start()
     driver = LockstepDriver(segment, lambda _: 24, False, 8)
     stage = FaultStage(segment, driver)
 
@@ -60,13 +57,10 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
             stage.act_within_tick(tick)
 
     driver.controller = Controller()
-    driver.run()
-    thread.join(BOUND_S)
-    assert seen == [
-        (tick, at)
-        for tick, at in ((0, Stage.WAITING), (8, Stage.ACTIVE), (16, Stage.OVER))
-        for _ in "ab"
-    ]
+    with in_thread(serve):
+        driver.run()
+    stages = (0, Stage.WAITING), (8, Stage.ACTIVE), (16, Stage.OVER)
+    assert seen == [at for at in stages for _ in range(2)]
     assert (entry.tick, entry.until) == (3, 9)
 
 
@@ -75,8 +69,7 @@ class Site:
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
-        segment.words[System.LOCKSTEP] = 1
-        segment.words[System.PERIOD_NS] = 2_500_000
+        segment.words[System.LOCKSTEP], segment.words[System.PERIOD_NS] = 1, 2_500_000
         self.table = FaultTable(segment)
         self.driver = LockstepDriver(segment, lambda _: None, False, 8)
         self.stage = FaultStage(segment, self.driver)
@@ -85,36 +78,24 @@ class Site:
 
     def add(self, kind: str, task: int = 0, **more: Any) -> FaultEntry:
         """Add a fault, of the writer if nothing else is said."""
-        defaults = tuple(p.default or 1.0 for p in KINDS[kind].parameters)
-        return self.table.add_fault(
-            Injection(KINDS[kind].number, task, parameters=defaults, **more)
-        )
+        number, defaults = KINDS[kind].number, [p.default or 1.0 for p in KINDS[kind].parameters]
+        return self.table.add_fault(Injection(number, task, parameters=tuple(defaults), **more))
 
-    def alarms(self) -> list[tuple[Alarm, int, int, float]]:
-        """Return code, tick, subject and value of the alarms since the last call."""
+    def advance(self, *ticks: int) -> list[tuple[Alarm, int, int, float]]:
+        """Go through these ticks; return code, tick, subject and value of the alarms."""
+        for tick in ticks:
+            self.stage.advance_faults(tick)
         rows = self._ring.read_new_rows().rows
         return [
             (Alarm(row["code"]), int(row["tick"]), int(row["subject"]), float(row["value"]))
             for row in rows
         ]
 
-    def advance(self, *ticks: int) -> list[tuple[Alarm, int, int, float]]:
-        for tick in ticks:
-            self.stage.advance_faults(tick)
-        return self.alarms()
-
 
 @pytest.fixture
 def site(make_bus: MakeBus) -> Site:
-    return Site(
-        make_bus(
-            task("writer"),
-            task("reader", slot=3),
-            task("other", slot=4),
-            mailbox(),
-            mailbox(name="other.point", writer="other"),
-        )
-    )
+    tasks = task("writer"), task("reader", slot=3), task("other", slot=4)
+    return Site(make_bus(*tasks, mailbox(), mailbox(name="other.point", writer="other")))
 
 
 def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
@@ -166,7 +147,6 @@ def test_a_restarted_clock_awaits_the_same_messages(site: Site) -> None:
     site.add("mute", tick=2, ticks=3)
     site.advance(2, 5)
     site.segment.words[System.STATE] = Run.RUNNING
-    site.alarms()
     site.stage = FaultStage(site.segment, site.driver)
     writer = open_writer(site.segment, NAME)
     writer.write(5)
@@ -209,9 +189,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
     assert again.count == 0
 
 
-def test_a_hanging_task_continues_at_the_end_of_its_fault_unless_it_is_lost(
-    site: Site,
-) -> None:
+def test_a_hanging_task_continues_at_the_end_of_its_fault_unless_it_is_lost(site: Site) -> None:
     block = site.segment.get_block("writer")
     with forked(signal.pause) as pid:
         block[Block.PID] = pid

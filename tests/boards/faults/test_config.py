@@ -11,10 +11,8 @@ from rack.boards.config import FAULTS, list_names, load, load_text, resolve_layo
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
-from tests import reference
 
 Write = Callable[[str, str], Path]
-SCRIPT = '[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 8\n'
 
 
 def test_no_parameter_has_the_name_of_a_common_fault_key() -> None:
@@ -28,15 +26,15 @@ def test_no_parameter_has_the_name_of_a_common_fault_key() -> None:
 def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(
     text: object, seconds: float
 ) -> None:
-    assert FaultConfig.model_validate(
-        {"kind": "mute", "board": "wave", "for": text}
-    ).lasts == pytest.approx(seconds)
+    fault = FaultConfig.model_validate({"kind": "mute", "board": "wave", "for": text})
+    assert fault.lasts == pytest.approx(seconds)
 
 
 def test_the_faults_of_a_script_come_after_those_of_the_config(small: Path, write: Write) -> None:
     own = 'fault=[{ kind = "hang", board = "upper" }]'
-    path = write("mine.toml", small.read_text() + '\n[[fault]]\nkind = "hang"\nboard = "upper"\n')
-    script = write("script.toml", SCRIPT + '\n[[fault]]\nkind = "mute"\nboard = "upper"\n')
+    tables = [f'[[fault]]\nkind = "{kind}"\nboard = "upper"\n' for kind in ("hang", "kill", "mute")]
+    path = write("mine.toml", f"{small.read_text()}\n{tables[0]}")
+    script = write("script.toml", tables[1] + tables[2])
     assert [fault.kind for fault in load(path, faults=script).fault] == ["hang", "kill", "mute"]
     assert [fault.kind for fault in load(small, [own]).fault] == ["hang"]
     assert load(small, faults=str(script)).fault == load(small, faults=script).fault
@@ -56,7 +54,3 @@ def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text:
         ConfigError, match=r"script.toml: \w+: a fault script contains \[\[fault\]\] tables and"
     ):
         load(small, faults=write("script.toml", text))
-
-
-def test_the_page_of_all_keys_has_those_of_faults() -> None:
-    assert reference.is_on_page("fault")

@@ -58,17 +58,12 @@ def test_a_fault_lasts_for_a_time_or_for_cycles_of_its_task(
 
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
-    (found,) = injected(
-        config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"}
-    )
-    layout = resolve_layout(rack(config))
+    when = f"watch.status.state=={value}"
+    (found,) = injected(config, {"kind": "kill", "board": "wave", "when": when})
     assert found.when is not None
-    box, field, number = found.when
-    assert (layout.mailboxes[box].name, layout.mailboxes[box].fields[field].name) == (
-        "watch.status",
-        "state",
-    )
-    assert number == State.DONE
+    at, field, number = found.when
+    box = resolve_layout(rack(config)).mailboxes[at]
+    assert (box.name, box.fields[field].name, number) == ("watch.status", "state", State.DONE)
 
 
 def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) -> None:

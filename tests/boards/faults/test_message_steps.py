@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.fault_table import FaultTable, Injection
+from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.layout import PROTOCOLS, Protocol
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.process import read_state
@@ -43,6 +43,18 @@ def link(rack_name: str) -> Iterator[MakeLink]:
         yield make
 
 
+def run_with_fault(rack: Link, kind: str) -> FaultEntry | None:
+    """Run a link before, during and after a fault. A forged message has no entry in the table."""
+    rack.run(0, BEGIN)
+    assert rack.alarms("reader") == rack.alarms("writer") == []
+    assert not any(seen.is_lost for seen in rack.reader.seen)
+    entry = rack.fault(kind, *FAULTS[kind]) if kind in FAULTS else forge(rack, BEGIN)
+    rack.run(BEGIN, END)
+    rack.heal()
+    rack.run(END, LAST)
+    return entry
+
+
 def forge(rack: Link, tick: int) -> None:
     assert exit_status(fork(lambda: messages.forge_message(rack.segment, NAME, tick))) == 0
 
@@ -56,13 +68,8 @@ def test_a_fault_is_detected_within_its_bound_and_identified_and_nothing_before_
     link: MakeLink, kind: str, protocol: Protocol, rates: tuple[int, int], reader_first: bool
 ) -> None:
     rack = link(protocol, rates, reader_first)
-    rack.run(0, BEGIN)
-    assert rack.alarms("reader") == rack.alarms("writer") == []
-    assert not any(seen.is_lost for seen in rack.reader.seen)
-    entry = rack.fault(kind, *FAULTS[kind])
-    rack.run(BEGIN, END)
-    rack.heal()
-    rack.run(END, LAST)
+    entry = run_with_fault(rack, kind)
+    assert entry is not None
     about = KINDS[kind]
     injection = Injection(about.number, 0, 0, parameters=FAULTS[kind])
     bound = about.compute_bound_ticks(injection, rack.segment.layout, "reader")
@@ -84,14 +91,7 @@ def test_reads_with_a_fault_depend_on_ticks_alone(
     runs = []
     for reader_first in (False, True):
         rack = link("time-slice", rates, reader_first)
-        rack.run(0, BEGIN)
-        if kind == "masquerade":
-            forge(rack, BEGIN)
-        else:
-            rack.fault(kind, *FAULTS[kind])
-        rack.run(BEGIN, END)
-        rack.heal()
-        rack.run(END, LAST)
+        run_with_fault(rack, kind)
         runs.append((rack.reader.seen, rack.alarms(), rack.written()))
     (seen, alarms, written), (seen_again, alarms_again, written_again) = runs
     assert seen == seen_again

@@ -16,7 +16,6 @@ from rack.boards.faults.bounds import cycle_bound
 from rack.tools.commands.inject import format_kinds
 from tests.boards.conftest import PLAIN, MakeConfig
 
-BOUND_S = 60
 MODULE = "gauge_levels"
 GAUGED = PLAIN.replace("wave_levels:Wave", f"{MODULE}:Gauge").replace(
     "wave_levels:Watch", f"{MODULE}:GaugeWatch"
@@ -55,18 +54,14 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_enum(
     found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
     layout = resolve_layout(found)
     (injection,) = build_injections(found, layout)
-    assert injection.when == (
-        0,
-        [field.name for field in layout.mailboxes[0].fields].index("valve"),
-        3,
-    )
+    fields = [field.name for field in layout.mailboxes[0].fields]
+    assert injection.when == (0, fields.index("valve"), 3)
 
 
 @pytest.mark.slow
 def test_a_users_kind_acts_and_is_detected(config: MakeConfig) -> None:
-    with Rack(
-        config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)
-    ) as rack:
+    lossy = fault('cycles = 80, n = 4, when = "wave.status.valve == open"')
+    with Rack(config(lossy, text=GAUGED)) as rack:
         outcome = rack.run(1.0)
         events = rack.events
     assert outcome.is_success

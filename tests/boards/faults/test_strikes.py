@@ -30,11 +30,9 @@ LOCKSTEP = [kind for kind in KINDS if not kind.realtime and kind.where != "start
 def faults(kind: Kind) -> list[dict[str, Any]]:
     """Return three faults of a kind, one after the other."""
     board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
-    once = ("tick", "seed")
-    keys = [
-        {key: strike[key] for key in strike if key in once or not kind.once} for strike in STRIKES
-    ]
-    return [{"kind": kind.name, "board": board, **strike} for strike in keys]
+    found = [{"kind": kind.name, "board": board, **strike} for strike in STRIKES]
+    lasting = ("cycles", "for") if kind.once else ()
+    return [{key: fault[key] for key in fault if key not in lasting} for fault in found]
 
 
 RACKS = {"followed": FOLLOWED, "driven": DRIVEN}

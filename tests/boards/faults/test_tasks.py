@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
-from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.process import read_processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
@@ -24,8 +23,6 @@ from rack.boards.faults.tasks import (
     compute_slice_end,
     take_core,
 )
-from rack.levels.fault_steps import Fault
-from rack.levels.level import Executor
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.machine import needs_fifo
@@ -57,9 +54,8 @@ def load(segment: Segment, kind: str, until: LoadStep, *parameters: float) -> Ex
     entry = FaultTable(segment).add_fault(
         Injection(KINDS[kind].number, 0, tick=0, seed=5, parameters=parameters)
     )
-    return ExtraComputing(
-        entry, task("level", every=3, within_cycles=2), SystemClock(segment), until
-    )
+    level = task("level", every=3, within_cycles=2)
+    return ExtraComputing(entry, level, SystemClock(segment), until)
 
 
 def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus) -> None:
@@ -80,10 +76,8 @@ def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = period = 2_500_000
     segment.words[System.EPOCH_NS] = epoch = 1_000_000_000
-    assert (
-        compute_cycle_end(load(segment, "overrun", compute_cycle_end, 2.0, 0.0), 4, 77)
-        == 77 + 2 * 3 * period
-    )
+    overrun = load(segment, "overrun", compute_cycle_end, 2.0, 0.0)
+    assert compute_cycle_end(overrun, 4, 77) == 77 + 2 * 3 * period
     random = load(segment, "overrun", compute_cycle_end, 2.0, 1.0)
     drawn = [compute_cycle_end(random, tick, 0) for tick in range(50)]
     assert drawn == [compute_cycle_end(random, tick, 0) for tick in range(50)]
@@ -96,50 +90,32 @@ def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus:
     assert compute_slice_end(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
 
 
-class Level:
-    """The part of an executor that has faults."""
-
-    def __init__(self) -> None:
-        self.injected: list[Fault] = []
-
-    def inject(self, faults: list[Fault]) -> None:
-        self.injected = faults
-
-
-class Writes:
-    """The part of a task's ports that has faults."""
-
-    def __init__(self) -> None:
-        self.applied: list[str] = []
-
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
-        self.applied = [find_kind(entry).name for entry in faults]
-
-
 def test_a_task_has_the_faults_that_are_active_by_its_tick(make_bus: MakeBus) -> None:
     segment = make_bus(task("level"), task("other"))
     table = FaultTable(segment)
-    level = Level()
-    outputs = Writes()
-    faults = TaskFaults(
-        segment, segment.layout.find_task("level"), outputs.apply, cast(Executor, level)
-    )
-    kinds = ("overrun", "drop", "sensor-bias", "hog")
+    level, outputs = Mock(), Mock()
+    faults = TaskFaults(segment, segment.layout.find_task("level"), outputs, level)
     entries = [
         table.add_fault(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))
-        for kind in kinds
+        for kind in ("overrun", "drop", "sensor-bias", "hog")
     ]
     table.add_fault(Injection(KINDS["drop"].number, 1, tick=4))
-    assert (faults.refresh_faults(3), faults.loads, outputs.applied) == (table.generation, [], [])
+
+    def applied() -> list[str]:
+        """The faults that the task's ports were given last."""
+        (given,) = outputs.call_args.args
+        return [find_kind(entry).name for entry in given]
+
+    assert (faults.refresh_faults(3), faults.loads, applied()) == (table.generation, [], [])
     for entry in entries:
         entry.stage = Stage.ACTIVE
         entry.tick = 4
     # The clock works ahead: for this task they begin a tick later.
-    assert (faults.refresh_faults(3), faults.loads, outputs.applied) == (-1, [], [])
+    assert (faults.refresh_faults(3), faults.loads, applied()) == (-1, [], [])
     assert faults.refresh_faults(4) == table.generation
     assert [load.entry.kind for load in faults.loads] == [KINDS["overrun"].number]
-    assert outputs.applied == ["drop"]
-    (struck,) = level.injected
+    assert applied() == ["drop"]
+    ((struck,),) = level.inject.call_args.args
     assert (struck.kind, struck.seed, struck.since) == ("sensor-bias", 9, 4)
     faults.count_actions({0: True}, 6)
     assert (entries[2].count, entries[2].struck_tick) == (1, 6)

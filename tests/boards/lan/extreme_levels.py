@@ -33,11 +33,9 @@ class Extremes(Executor):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the port that sends."""
         return ConfiguredPorts(outputs={params["port"]: Output(message_class(params["type"]))})
 
     def process(self, tick: int) -> None:
-        """Write the next one."""
         at = min(tick // self.context.every, len(self._rows) - 1)
         self.ports[self.context.params["port"]].raw[:] = self._rows[at]
 
@@ -75,7 +73,6 @@ def cases(
 def filled(
     kind: type[Message], base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
 ) -> Message:
-    """Return a message with these fields."""
     message = AnyMessage(kind.message_type.build_dtype(sizes or {}))
     for name, value in base.items():
         if isinstance(value, Mapping):

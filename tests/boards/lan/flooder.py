@@ -28,16 +28,12 @@ BURST = 64
 
 def main(name: str, endpoint: str, victim: str) -> None:
     exports = {port: {"from": f"{port}.status"} for port in ("pulse", "calm")}
-    link = LanLink(
-        name,
-        LanTable.model_validate({"connect": (endpoint,), "peers": (victim,), "export": exports}),
-    )
+    table = {"connect": (endpoint,), "peers": (victim,), "export": exports}
+    link = LanLink(name, LanTable.model_validate(table))
     flood, calm = (link.publish(out_key(name, f"{port}.status")) for port in ("pulse", "calm"))
-    dtype = build_message_dtype(
-        build_field_specs(PulseStatus.message_type, {}),
-        PulseStatus.message_type.build_dtype({}).itemsize,
-    )
-    message, kind, number, due = Message(dtype), compute_kind("pulse", 1, dtype), 0, 0
+    kind = PulseStatus.message_type
+    dtype = build_message_dtype(build_field_specs(kind, {}), kind.build_dtype({}).itemsize)
+    message, code, number, due = Message(dtype), compute_kind("pulse", 1, dtype), 0, 0
     link.declare_token(LAUNCH)
     while not select.select([sys.stdin], [], [], 0)[0]:
         for at in range(BURST):
@@ -45,7 +41,7 @@ def main(name: str, endpoint: str, victim: str) -> None:
         if (now := time.monotonic_ns()) >= due:
             number, due, message.count = number + 1, now + CALM_NS, number
             payload = bytes(message.raw)
-            head = Envelope(kind, LAUNCH, number, number, 0, 0, now)
+            head = Envelope(code, LAUNCH, number, number, 0, 0, now)
             calm(payload, link.sealer.seal(out_key(name, "calm.status"), head, payload))
     link.close()
 

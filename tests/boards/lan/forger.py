@@ -10,7 +10,6 @@ stdin.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from datetime import UTC, datetime, timedelta
@@ -24,7 +23,7 @@ from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import ReceivedMessage
 from rack.tools.network import certificates
-from tests.boards.lan.home import serve
+from tests.boards.lan.home import open_session, serve
 
 PERIOD_S = 0.01
 LATER = 1000
@@ -56,17 +55,7 @@ class Forger:
     """A session without rules of its own."""
 
     def __init__(self, folder: Path, name: str, other: str, endpoints: list[str]) -> None:
-        config = zenoh.Config()
-        settings = {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "connect/endpoints": endpoints,
-            "connect/timeout_ms": -1,
-        }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        self._session = zenoh.open(config)
+        self._session = open_session({"connect/endpoints": endpoints})
         self._own = Sealer(Credentials(folder, name))
         self._sealers = [
             self._own,

@@ -12,8 +12,10 @@ import select
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
+
+import zenoh
 
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, Flaw
@@ -23,6 +25,15 @@ from rack.boards.lan.link import MAX_UNREAD, LanLink
 HEAD = Envelope(1, 2, 3, 4, 5, 6, 7)
 PERIOD_S = 0.005
 LAUNCH = 7
+
+
+def open_session(settings: Mapping[str, Any]) -> zenoh.Session:
+    """Open a plain session, with no rules of its own, that looks for nobody but its endpoints."""
+    config, quiet = zenoh.Config(), {"mode": "peer", "connect/timeout_ms": -1}
+    quiet |= {f"scouting/{way}/enabled": False for way in ("multicast", "gossip")}
+    for key, value in {**quiet, **settings}.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
 
 
 class Home:
@@ -37,10 +48,8 @@ class Home:
             link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()
         ]
         self._questions = link.open_questions(estop_key("*", rack), MAX_UNREAD)
-        self._exports = [
-            (key, link.publish(key))
-            for key in (out_key(rack, e.source) for e in table.exports.values())
-        ]
+        keys = [out_key(rack, entry.source) for entry in table.exports.values()]
+        self._exports = [(key, link.publish(key)) for key in keys]
         self._changes = link.watch_tokens()
         link.declare_token(LAUNCH)
         self._came, self._good, self._asked = Counter[str](), Counter[str](), Counter[str]()

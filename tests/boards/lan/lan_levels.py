@@ -21,8 +21,6 @@ class Heard(Status, version=1):
 
 
 class Pulse(Executor):
-    """Counts its cycles."""
-
     status = Output(PulseStatus)
 
     def process(self, tick: int) -> None:

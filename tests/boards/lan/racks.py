@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -33,28 +33,6 @@ from tests.processes import BOUND_S
 ROOT = Path(__file__).resolve().parents[3]
 LAUNCH_S = 60.0
 """Bound of the launch of racks in processes of their own: on a loaded machine it takes 20 s."""
-BASE = f"""
-python_path = ["{Path(__file__).parent}"]
-
-[clock]
-period_ms = 2.5
-
-[board.pulse]
-slot = 2
-rate_hz = 50
-executor = "lan_levels:Pulse"
-"""
-ECHO = """
-[board.echo]
-slot = 3
-rate_hz = 100
-executor = "lan_levels:Echo"
-"""
-EXPORT = """
-[adapter.lan.export.pulse]
-from = "pulse.status"
-rate_hz = 50
-"""
 
 
 def rack_text(
@@ -76,23 +54,35 @@ def rack_text(
         insecure = any(end.startswith("tcp/") for end in (listen, *connect))
     if insecure:
         lan = f"insecure = true\n{lan}"
-    imported = f"""
+    text = f"""
+format = 2
+name = "{name}"
+python_path = ["{Path(__file__).parent}"]
+
+[clock]
+period_ms = 2.5
+
+[adapter.lan]
+slot = 5
+listen = {json.dumps([listen] if listen else [])}
+connect = {json.dumps(list(connect))}
+peers = {json.dumps(list(peers))}
+export.pulse = {{ from = "pulse.status", rate_hz = 50 }}
+{lan}
+
+[board]
+pulse = {{ slot = 2, rate_hz = 50, executor = "lan_levels:Pulse" }}
+"""
+    if not other:
+        return text
+    return f"""{text}echo = {{ slot = 3, rate_hz = 100, executor = "lan_levels:Echo" }}
+
 [adapter.lan.import.other]
 from = "{other}/pulse.status"
 type = "lan_levels:PulseStatus"
 rate_hz = 50
 max_age_ms = 100
 """
-    table = f"""
-[adapter.lan]
-slot = 5
-listen = {json.dumps([listen] if listen else [])}
-connect = {json.dumps(list(connect))}
-peers = {json.dumps(list(peers))}
-{lan}
-"""
-    head = f'format = 2\nname = "{name}"\n'
-    return f"{head}{BASE}{ECHO if other else ''}{table}{EXPORT}{imported if other else ''}"
 
 
 def endpoints(count: int) -> list[str]:
@@ -100,23 +90,17 @@ def endpoints(count: int) -> list[str]:
     return [f"tcp/127.0.0.1:{find_free_port()}" for _ in range(count)]
 
 
-def ring_texts(
-    names: Sequence[str], peers: Mapping[str, Iterable[str]] | None = None, lan: str = ""
-) -> list[str]:
+def ring_texts(names: Sequence[str]) -> list[str]:
     """Return the configs of racks that all know each other, each of which adds up the pulse of the
     one before it."""
-    at = endpoints(len(names))
-    texts = []
+    at, texts = endpoints(len(names)), []
     for k, name in enumerate(names):
-        others = (
-            [other for other in names if other != name] if peers is None else peers.get(name, ())
-        )
-        texts.append(rack_text(name, at[k], at[:k], names[k - 1], peers=others, lan=lan))
+        others = [other for other in names if other != name]
+        texts.append(rack_text(name, at[k], at[:k], names[k - 1], peers=others))
     return texts
 
 
 def configs(texts: Iterable[str], folder: Path, *settings: str) -> list[RackConfig]:
-    """Return the configs of these texts, with settings."""
     found = []
     for k, text in enumerate(texts):
         path = folder / f"rack-{k}.toml"
@@ -174,14 +158,10 @@ def run_together(racks: Sequence[RackConfig], seconds: Sequence[float | None]) -
 def ended(rack: Rack) -> Ended:
     """Return how a rack has ended, which is not closed yet."""
     assert rack.outcome is not None
-    seen = {
-        box.name: open_observer(rack.segment, box.name).peek().message
-        for box in rack.segment.layout.mailboxes
-    }
-    last = {
-        name: {field: getattr(value, field) for field in value.record.dtype.names}
-        for name, value in seen.items()
-    }
+    last = {}
+    for box in rack.segment.layout.mailboxes:
+        message = open_observer(rack.segment, box.name).peek().message
+        last[box.name] = {name: getattr(message, name) for name in message.record.dtype.names}
     return Ended(rack.outcome, rack.events, last)
 
 
@@ -199,14 +179,8 @@ class RackProcess:
         *settings: str,
         popen: Callable[..., subprocess.Popen[str]] = subprocess.Popen,
     ) -> None:
-        command = [
-            sys.executable,
-            "-m",
-            "tests.boards.lan.racks",
-            str(config),
-            str(seconds or 0),
-            *settings,
-        ]
+        command = [sys.executable, "-m", "tests.boards.lan.racks", str(config), str(seconds or 0)]
+        command += settings
         self._process = popen(
             command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

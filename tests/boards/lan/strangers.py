@@ -21,7 +21,7 @@ import zenoh
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.keys import ALL_ALIVE
-from tests.boards.lan.home import HEAD, serve
+from tests.boards.lan.home import HEAD, open_session, serve
 
 PERIOD_S = 0.02
 ASKED_EVERY = 5
@@ -32,29 +32,13 @@ class Stranger:
     sealed for), asks, keys to listen to, token."""
 
     def __init__(self, table: dict[str, Any]) -> None:
-        config = zenoh.Config()
-        off = ("scouting/multicast", "scouting/gossip", "transport/shared_memory")
-        quiet = {f"{key}/enabled": False for key in off}
-        lasting = {"connect/timeout_ms": -1, "open/return_conditions/connect_scouted": False}
         # Zenoh takes no connection for 0.1 s after each that fails: strangers that try often would
         # keep the others out.
         again = 1000 if table.get("fails") else 50
-        retry = {
-            "connect/retry": {
-                "period_init_ms": again,
-                "period_max_ms": again,
-                "period_increase_factor": 1,
-            }
-        }
-        for key, value in {
-            "mode": "peer",
-            **quiet,
-            **lasting,
-            **retry,
-            **table["settings"],
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        self._session = session = zenoh.open(config)
+        retry = {"period_init_ms": again, "period_max_ms": again, "period_increase_factor": 1}
+        own = {"transport/shared_memory/enabled": False, "connect/retry": retry}
+        own["open/return_conditions/connect_scouted"] = False
+        self._session = session = open_session({**own, **table["settings"]})
         folder, name = table.get("seals", ("", ""))
         sealer = Sealer(Credentials(Path(folder), name)) if folder else Sealer()
         self._puts = []

@@ -67,17 +67,12 @@ def test_without_tls_rules_are_for_anyone_and_over_tls_each_is_for_one_certifica
 
 
 def test_puts_come_from_a_rack_itself_and_only_what_is_imported() -> None:
-    imports = {"own": {"from": "friend/pulse.status", **ENTRY}}
-    found = {
-        (key, name)
-        for flow, message, key, name in rules(
-            TLS, **{"import": imports}, peers=("other",), estop_from=["viewer"]
-        )
-        if (flow, message) == (IN, "put")
-    }
+    imports = {"import": {"own": {"from": "friend/pulse.status", **ENTRY}}}
+    found = rules(TLS, **imports, peers=("other",), estop_from=["viewer"])
+    puts = {(key, name) for flow, message, key, name in found if (flow, message) == (IN, "put")}
     keys = ("step", "ping/home", "pong/home")
     expected = {(f"rack/{name}/{key}", name) for name in ("friend", "other") for key in keys}
-    assert found == {*expected, ("rack/friend/out/pulse/status", "friend")}
+    assert puts == {*expected, ("rack/friend/out/pulse/status", "friend")}
 
 
 def test_what_goes_out_is_this_racks_own() -> None:

@@ -4,13 +4,12 @@ racks."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from rack.backplane.message import Message, State, field
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.message import State
+from rack.backplane.segment import Segment
 from rack.backplane.words import System, is_switched_on
 from rack.boards.config import resolve
 from rack.boards.lan.adapter import LanAdapter
@@ -19,10 +18,9 @@ from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.status import build_status_class
 from rack.levels.peer import PeerPresence
 from rack.levels.references import find_class
+from tests.boards.lan.conftest import EVERY, MakeSegment
 from tests.boards.lan.racks import configs, rack_text
 
-EVERY = 8
-"""Ticks of the adapter's cycle."""
 PERIOD_NS = 2_500_000
 STOP = 'on_peer_loss = "stop"'
 FIRST, SECOND = 7, 8
@@ -33,39 +31,32 @@ Change = tuple[str, int, bool]
 
 
 @pytest.fixture
-def make(rack_name: str, tmp_path: Path) -> Iterator[MakeAdapter]:
+def make(make_segment: MakeSegment, rack_name: str, tmp_path: Path) -> MakeAdapter:
     """Make the one adapter of a test: what comes and goes is what its list has."""
-    with ExitStack() as stack:
 
-        def make_one(
-            changes: list[Change], lan: str = "", *, lockstep: bool = False
-        ) -> tuple[LanAdapter, Segment]:
-            text = rack_text(rack_name, "tcp/127.0.0.1:7447", (), "b", peers=("b",), lan=lan)
-            mode = "lockstep" if lockstep else "realtime"
-            (config,) = configs([text], tmp_path, f"clock.mode={mode}")
-            plan = resolve(config)
-            segment = Segment.create(plan.layout, "")
-            stack.callback(unlink_segment, rack_name)
-            stack.callback(segment.close)
-            segment.words[System.LOCKSTEP] = lockstep
-            segment.words[System.PERIOD_NS] = PERIOD_NS
-            (wiring,) = (task for task in plan.tasks if task.task == "lan")
-            adapter = find_class(wiring.target, LanAdapter)(wiring.context)
-            adapter.attach_segment(segment, None)
+    def make_one(
+        changes: list[Change], lan: str = "", *, lockstep: bool = False
+    ) -> tuple[LanAdapter, Segment]:
+        text = rack_text(rack_name, "tcp/127.0.0.1:7447", (), "b", peers=("b",), lan=lan)
+        mode = "lockstep" if lockstep else "realtime"
+        (config,) = configs([text], tmp_path, f"clock.mode={mode}")
+        plan = resolve(config)
+        segment = make_segment(plan.layout, lockstep=lockstep)
+        (wiring,) = (task for task in plan.tasks if task.task == "lan")
+        adapter = find_class(wiring.target, LanAdapter)(wiring.context)
+        adapter.attach_segment(segment, None)
 
-            def taken() -> Iterator[Change]:
-                while changes:
-                    yield changes.pop(0)
+        def taken() -> Iterator[Change]:
+            while changes:
+                yield changes.pop(0)
 
-            adapter._peers.set_source(taken, lockstep)
-            return adapter, segment
+        adapter._peers.set_source(taken, lockstep)
+        return adapter, segment
 
-        yield make_one
+    return make_one
 
 
-def test_a_lost_rack_stops_the_arm_until_it_is_back(
-    make: MakeAdapter,
-) -> None:
+def test_a_lost_rack_stops_the_arm_until_it_is_back(make: MakeAdapter) -> None:
     changes: list[Change] = []
     adapter, segment = make(changes, STOP)
     stop = segment.words[System.PEER_STOP]
@@ -115,18 +106,6 @@ def test_a_rack_that_joins_is_sent_every_newest_message(make: MakeAdapter) -> No
     assert export.must_resend
 
 
-class Sent(Message, version=1):
-    value: float = field(unit="1", doc="a number")
-
-
-IMPORTED = {
-    "from": "b/pulse.status",
-    "type": "lan_levels:PulseStatus",
-    "rate_hz": 50,
-    "max_age_ms": 100,
-}
-
-
 def test_the_status_says_why_the_exchange_is_incomplete(make: MakeAdapter) -> None:
     changes: list[Change] = []
     adapter, _ = make(changes)
@@ -160,8 +139,6 @@ def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -
     adapter._imports.clear()
 
     class Link:
-        """The link's end that counts."""
-
         sealer = Sealer()
 
     Link.sealer.flaws = dict.fromkeys(Flaw, 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rack.backplane.layout import Layout
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.lan import clocks
 from rack.boards.lan.clocks import (
@@ -39,10 +38,12 @@ from rack.boards.lan.link import ReceivedMessage
 from rack.boards.lan.peers import PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.network.certificates import make_credentials
+from tests.boards.lan.conftest import MakeSegment
 
 S, MS, US = 1_000_000_000, 1_000_000, 1_000
 CLOCK_NS, PERIOD_NS = 2_500_000, 1_250_000
 """Twice as fast as time."""
+LAUNCH, OTHER = 11, 22
 AHEAD_NS = 1000 * S
 """How far the clock of the other machine is ahead."""
 
@@ -70,9 +71,8 @@ def test_the_true_offset_is_always_within_the_uncertainty(
         assert found.steps == 0
         assert found.best is not None
         for later in (now, now + 7 * S):
-            assert abs(
-                found.best.offset_ns - (theirs(later) - later)
-            ) <= found.best.compute_uncertainty_ns(later)
+            error_ns = abs(found.best.offset_ns - (theirs(later) - later))
+            assert error_ns <= found.best.compute_uncertainty_ns(later)
 
 
 def trip(at: int, offset: int, there: int = 200 * US, back: int = 200 * US) -> RoundTrip:
@@ -127,16 +127,13 @@ def test_measurements_of_an_earlier_launch_are_discarded() -> None:
 
 
 @pytest.fixture
-def segment(rack_name: str) -> Iterator[Segment]:
-    made = Segment.create(Layout(rack_name, CLOCK_NS, (), ()), "")
-    yield made
-    made.close()
-    unlink_segment(rack_name)
+def segment(make_segment: MakeSegment, rack_name: str) -> Segment:
+    made = make_segment(Layout(rack_name, CLOCK_NS, (), ()))
+    made.words[System.PERIOD_NS], made.words[System.EPOCH_NS] = PERIOD_NS, 100 * S
+    return made
 
 
 def test_a_message_never_counts_as_younger_than_it_is(segment: Segment) -> None:
-    segment.words[System.PERIOD_NS] = PERIOD_NS
-    segment.words[System.EPOCH_NS] = 100 * S
     grid, peer = OwnGrid(segment, 1), PeerRack("b")
     head = Envelope(0, 0, 1, 1, 0, 0, stamp_ns=1100 * S + 10 * PERIOD_NS)
     peer.offset_ns, peer.uncertainty_ns = 1000 * S, 0
@@ -146,19 +143,11 @@ def test_a_message_never_counts_as_younger_than_it_is(segment: Segment) -> None:
 
 
 def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> None:
-    segment.words[System.PERIOD_NS] = PERIOD_NS
-    segment.words[System.EPOCH_NS] = 100 * S
     peers = Peers(["b"])
     found = Clocks(segment, peers, 1, OwnGrid(segment, 1))
     found.write_clock(out := SimpleNamespace(), "b", 4)
-    assert vars(out) == {
-        "steps": 0,
-        "offset": 0.0,
-        "ahead": 0.0,
-        "speed": 0.0,
-        "uncertainty": -1.0,
-        "round_trip": -1.0,
-    }
+    unknown = dict.fromkeys(("uncertainty", "round_trip"), -1.0)
+    assert vars(out) == dict.fromkeys(("steps", "offset", "ahead", "speed"), 0.0) | unknown
     peers["b"].add_token(7, 0)
     clock = found._clocks["b"]
     clock.epoch_ns, clock.period_ns, clock.clock_ns = 1100 * S, 2 * MS, 5 * MS
@@ -173,78 +162,12 @@ def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> Non
     assert out.ahead == pytest.approx(2.5 * 1.0001 - 2.0, abs=1e-6)
 
 
-class Answers:
-    """Takes answers in place of a network."""
-
-    def __init__(self) -> None:
-        self.sent: list[ReceivedMessage] = []
-
-    def call_on_arrival(self, key: str, callback: Any) -> None:
-        """Bring nothing: the tests do."""
-
-    def publish(self, key: str) -> Any:
-        return lambda payload, envelope: self.sent.append(ReceivedMessage(key, envelope, payload))
-
-
-def clocks_of(segment: Segment) -> Clocks:
-    return Clocks(segment, Peers([]), 1, OwnGrid(segment, 1))
-
-
-def ping(asker: str, sealer: Sealer, to: str) -> ReceivedMessage:
-    key = f"rack/{asker}/ping/{to}"
-    return ReceivedMessage(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
-
-
-def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
-    segment.words[System.PERIOD_NS] = PERIOD_NS
-    segment.words[System.EPOCH_NS] = 100 * S
-    responder, network, sealer = clocks_of(segment), Answers(), Sealer()
-    responder.open(network, sealer)  # type: ignore[arg-type]
-    began = time.monotonic_ns()
-    for _ in range(1000):
-        responder._answer_ping(ping("flood", sealer, segment.rack))
-    most = 1 + (time.monotonic_ns() - began) // ANSWER_NS
-    assert 1 <= len(network.sent) == responder.answered <= most
-    assert responder.withheld == 1000 - responder.answered
-    # An answer says when the ping came, when it went itself, and on which grid this rack is.
-    key, envelope, payload = network.sent[0]
-    launch, received, *grid = _PONG.unpack(payload)
-    head = sealer.open_message(key, envelope, payload)
-    assert isinstance(head, Envelope)
-    assert (launch, grid) == (1, [100 * S, PERIOD_NS, CLOCK_NS])
-    assert began <= received <= head.stamp_ns
-    # One rack's flood takes nothing from another; but of racks, too, there are not endlessly many.
-    for at in range(MAX_ASKERS):
-        responder._answer_ping(ping(f"rack-{at}", sealer, segment.rack))
-    keys = {answer.key for answer in network.sent}
-    assert len(keys) == MAX_ASKERS
-    assert f"rack/{segment.rack}/pong/rack-0" in keys
-
-
-def test_a_ping_with_a_seal_of_another_rack_gets_no_answer(
-    segment: Segment, tmp_path: Path
-) -> None:
-    make_credentials(tmp_path, {segment.rack: [], "asker": [], "stranger": []}, 1)
-    own, asker, stranger = (
-        Sealer(Credentials(tmp_path, name)) for name in (segment.rack, "asker", "stranger")
-    )
-    responder, network = clocks_of(segment), Answers()
-    responder.open(network, own)  # type: ignore[arg-type]
-    responder._answer_ping(ping("asker", stranger, segment.rack))
-    assert network.sent == []
-    assert (responder.answered, responder.refused) == (0, 1)
-    responder._answer_ping(ping("asker", asker, segment.rack))
-    assert (responder.answered, responder.refused) == (1, 1)
-
-
 class Wire:
     """Two racks' clocks with a network between them that keeps every message until the test passes
     it on."""
 
     def __init__(self, segment: Segment) -> None:
-        segment.words[System.PERIOD_NS] = PERIOD_NS
-        segment.words[System.EPOCH_NS] = 100 * S
-        self._heard: dict[str, Any] = {}
+        self._rack, self._heard = segment.rack, dict[str, Any]()
         self.sent: list[ReceivedMessage] = []
         self.peers = Peers(["b"])
         self.clocks = Clocks(segment, self.peers, LAUNCH, OwnGrid(segment, 1))
@@ -258,7 +181,7 @@ class Wire:
     def publish(self, key: str) -> Any:
         return lambda payload, envelope: self.sent.append(ReceivedMessage(key, envelope, payload))
 
-    def answer(self, rack: str, ping: ReceivedMessage, **more: Any) -> None:
+    def answer(self, ping: ReceivedMessage, **more: Any) -> None:
         """Answer a ping, as rack `b` does at once, or otherwise."""
         head = self.sealer.open_message(ping.key, ping.envelope, ping.payload)
         assert isinstance(head, Envelope)
@@ -267,12 +190,11 @@ class Wire:
         told |= {"from": OTHER, "serial": head.serial, **more}
         theirs = now + AHEAD_NS
         payload = _PONG.pack(told["launch"], theirs, 50 * S, told["period"], told["clock"])
-        key = f"rack/b/pong/{rack}"
+        key = f"rack/b/pong/{self._rack}"
         back = Envelope(told["kind"], told["from"], told["serial"], told["serial"], 0, 0, theirs)
         seal = self.sealer.seal(key, back, payload)
-        self._heard[f"rack/*/pong/{rack}"](
-            ReceivedMessage(key, seal, payload + more.get("more", b""))
-        )
+        pong = ReceivedMessage(key, seal, payload + more.get("more", b""))
+        self._heard[f"rack/*/pong/{self._rack}"](pong)
 
     def take(self) -> tuple[int, int]:
         """Do a cycle; return the answers taken and refused so far."""
@@ -280,16 +202,57 @@ class Wire:
         return self.clocks.taken, self.clocks.refused
 
 
-LAUNCH, OTHER = 11, 22
-
-
 @pytest.fixture
 def wire(segment: Segment) -> Wire:
     return Wire(segment)
 
 
+def ping(asker: str, sealer: Sealer, to: str) -> ReceivedMessage:
+    key = f"rack/{asker}/ping/{to}"
+    return ReceivedMessage(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
+
+
+def test_a_flood_of_pings_is_bounded_and_counted(wire: Wire, segment: Segment) -> None:
+    responder, sealer = wire.clocks, wire.sealer
+    began = time.monotonic_ns()
+    for _ in range(1000):
+        responder._answer_ping(ping("flood", sealer, segment.rack))
+    most = 1 + (time.monotonic_ns() - began) // ANSWER_NS
+    assert 1 <= len(wire.sent) == responder.answered <= most
+    assert responder.withheld == 1000 - responder.answered
+    # An answer says when the ping came, when it went itself, and on which grid this rack is.
+    key, envelope, payload = wire.sent[0]
+    launch, received, *grid = _PONG.unpack(payload)
+    head = sealer.open_message(key, envelope, payload)
+    assert isinstance(head, Envelope)
+    assert (launch, grid) == (1, [100 * S, PERIOD_NS, CLOCK_NS])
+    assert began <= received <= head.stamp_ns
+    # One rack's flood takes nothing from another; but of racks, too, there are not endlessly many.
+    for at in range(MAX_ASKERS):
+        responder._answer_ping(ping(f"rack-{at}", sealer, segment.rack))
+    keys = {answer.key for answer in wire.sent}
+    assert len(keys) == MAX_ASKERS
+    assert f"rack/{segment.rack}/pong/rack-0" in keys
+
+
+def test_a_ping_with_a_seal_of_another_rack_gets_no_answer(
+    wire: Wire, segment: Segment, tmp_path: Path
+) -> None:
+    make_credentials(tmp_path, {segment.rack: [], "asker": [], "stranger": []}, 1)
+    own, asker, stranger = (
+        Sealer(Credentials(tmp_path, name)) for name in (segment.rack, "asker", "stranger")
+    )
+    responder = wire.clocks
+    responder.open(wire, own)  # type: ignore[arg-type]
+    responder._answer_ping(ping("asker", stranger, segment.rack))
+    assert wire.sent == []
+    assert (responder.answered, responder.refused) == (0, 1)
+    responder._answer_ping(ping("asker", asker, segment.rack))
+    assert (responder.answered, responder.refused) == (1, 1)
+
+
 def test_a_rack_is_pinged_often_until_its_clock_is_known(
-    wire: Wire, segment: Segment, monkeypatch: pytest.MonkeyPatch
+    wire: Wire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [time.monotonic_ns()]
     monkeypatch.setattr(clocks, "monotonic_ns", lambda: now[0])
@@ -300,19 +263,19 @@ def test_a_rack_is_pinged_often_until_its_clock_is_known(
         pause = PING_NS if trips >= EAGER_ROUND_TRIPS else EAGER_NS
         assert clock.due_ns == now[0] + pause
         monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
-        wire.answer(segment.rack, wire.sent[-1])
+        wire.answer(wire.sent[-1])
         now[0] += pause - 1
         wire.take()
         assert (len(wire.sent), len(clock.offset)) == (trips + 1, trips + 1)
         now[0] += 1
 
 
-def test_an_answer_is_taken_once_and_gives_offset_and_grid(wire: Wire, segment: Segment) -> None:
+def test_an_answer_is_taken_once_and_gives_offset_and_grid(wire: Wire) -> None:
     peer = wire.peers["b"]
     assert wire.take() == (0, 0)
     assert (peer.offset_ns, peer.uncertainty_ns) == (None, 0)
-    wire.answer(segment.rack, wire.sent[0])
-    wire.answer(segment.rack, wire.sent[0])
+    wire.answer(wire.sent[0])
+    wire.answer(wire.sent[0])
     assert wire.take() == (1, 1)
     clock = wire.clocks._clocks["b"]
     assert (clock.epoch_ns, clock.period_ns, clock.clock_ns) == (50 * S, 1_000_000, CLOCK_NS)
@@ -332,13 +295,11 @@ def test_an_answer_is_taken_once_and_gives_offset_and_grid(wire: Wire, segment: 
         {"more": b"x"},
     ],
 )
-def test_an_unexpected_answer_is_refused(
-    wire: Wire, segment: Segment, wrong: dict[str, Any]
-) -> None:
+def test_an_unexpected_answer_is_refused(wire: Wire, wrong: dict[str, Any]) -> None:
     wire.take()
-    wire.answer(segment.rack, wire.sent[0], **wrong)
+    wire.answer(wire.sent[0], **wrong)
     assert wire.take() == (0, 1)
-    wire.answer(segment.rack, wire.sent[0])
+    wire.answer(wire.sent[0])
     assert wire.take() == (1, 1)
 
 

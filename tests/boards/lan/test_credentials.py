@@ -38,10 +38,8 @@ def folder(made: Path, tmp_path: Path) -> Path:
 
 def flaws(folder: Path, rack: str = "cell", *addresses: str) -> list[str]:
     """Return what is wrong, without the folder's name."""
-    return [
-        str(flaw).removeprefix(f"{folder}/")
-        for flaw in Credentials(folder, rack).find_flaws(addresses)
-    ]
+    found = Credentials(folder, rack).find_flaws(addresses)
+    return [str(flaw).removeprefix(f"{folder}/") for flaw in found]
 
 
 def test_every_missing_file_is_named(tmp_path: Path) -> None:
@@ -179,14 +177,12 @@ def test_an_authority_may_sign_through_another_but_not_through_a_rack(
     root, root_key = step("root", None, 1)
     between, between_key = step("puma", ("root", root_key), below)
     own, own_key = step("cell", ("puma", between_key), None)
-    certificates.write_credentials(
-        tmp_path,
-        {
-            "authority.pem": certificates.to_pem(root),
-            "cell.pem": certificates.to_pem(own) + certificates.to_pem(between),
-            "cell-key.pem": certificates.key_to_pem(own_key),
-        },
-    )
+    files = {
+        "authority.pem": certificates.to_pem(root),
+        "cell.pem": certificates.to_pem(own) + certificates.to_pem(between),
+        "cell-key.pem": certificates.key_to_pem(own_key),
+    }
+    certificates.write_credentials(tmp_path, files)
     assert flaws(tmp_path) == expected
     found = Credentials(tmp_path, "cell")
     identity = found.identify_sender(found.key_pair.chain)

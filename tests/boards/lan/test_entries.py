@@ -33,21 +33,15 @@ class Importing:
     """The adapter's import `lan.other`, and a level that reads it."""
 
     def __init__(self, segment: Segment, goes_on: bool = False) -> None:
-        self.segment, self.peer, self.network = (
-            segment,
-            PeerRack("two", keeps_messages=goes_on, offset_ns=0),
-            Network(),
-        )
+        self.segment, self.network = segment, Network()
+        self.peer = PeerRack("two", keeps_messages=goes_on, offset_ns=0)
         self.grid = OwnGrid(segment, EVERY)
         config = load_text(segment.config)
         assert config.adapter.lan is not None
         self.table = config.adapter.lan.imports["other"]
         self.spec = segment.layout.find_mailbox("lan.other")
-        self.kind = compute_kind(
-            self.spec.message,
-            self.spec.version,
-            build_message_dtype(self.spec.fields, self.spec.size),
-        )
+        self.dtype = build_message_dtype(self.spec.fields, self.spec.size)
+        self.kind = compute_kind(self.spec.message, self.spec.version, self.dtype)
         self.key, self.sealer = out_key("two", "pulse.status"), Sealer()
         self.status = build_status_class((), ("other",)).zeros({})
         self.task = ReadingTask()
@@ -79,17 +73,24 @@ class Importing:
         **head: int,
     ) -> None:
         """Let a message arrive, written there at the time of our tick `written`."""
-        message = AnyMessage(build_message_dtype(self.spec.fields, self.spec.size))
+        message = AnyMessage(self.dtype)
         message.count = number if count is None else count
         message.record["state"] = state
         time_ns = self.grid.time_ns(written)
-        envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)._replace(
-            **head
-        )
+        envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)
         payload = bytes(message.raw)
-        self.network.come.append(
-            ReceivedMessage(self.key, self.sealer.seal(self.key, envelope, payload), payload)
-        )
+        seal = self.sealer.seal(self.key, envelope._replace(**head), payload)
+        self.network.come.append(ReceivedMessage(self.key, seal, payload))
+
+    def come(self, launch: int, tick: int) -> None:
+        """Let the other rack come, with a known clock."""
+        self.peer.add_token(launch, tick)
+        self.peer.offset_ns = 0
+
+    def deliver(self, tick: int, number: int, written: int, **more: int) -> None:
+        """Let a message arrive, and do a cycle."""
+        self.send(number, written, **more)
+        self.cycle(tick)
 
     def cycle(self, tick: int) -> None:
         self.entry.update_presence(tick)
@@ -112,8 +113,7 @@ class Importing:
 @pytest.fixture
 def importing(segment: Segment) -> Importing:
     found = Importing(segment)
-    found.peer.add_token(LAUNCH, 0)
-    found.peer.offset_ns = 0
+    found.come(LAUNCH, 0)
     return found
 
 
@@ -122,8 +122,7 @@ NONE, OLD, NEW = Verdict.NONE, Verdict.OLD, Verdict.NEW
 
 def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importing) -> None:
     assert importing.read(0) == (NONE, 0, False)
-    importing.send(1, written=2, count=77)
-    importing.cycle(8)
+    importing.deliver(8, 1, written=2, count=77)
     # By ticks: visible at the end of the adapter's cycle.
     assert importing.read(15) == (NONE, 0, False)
     assert importing.read(16) == (NEW, 77, False)
@@ -132,21 +131,16 @@ def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importin
     assert importing.read(3 + MAX_AGE) == (OLD, 77, True)
     importing.cycle(56)
     assert importing.entry.is_old(56)
-    assert (importing.status.import_other["age"], importing.status.import_other["age_s"]) == (
-        54,
-        54 * 0.0025,
-    )
-    importing.send(2, written=60)
-    importing.cycle(64)
+    status = importing.status.import_other
+    assert (status["age"], status["age_s"]) == (54, 54 * 0.0025)
+    importing.deliver(64, 2, written=60)
     assert importing.read(72) == (NEW, 2, False)
 
 
 def test_a_message_that_arrives_too_old_is_counted_and_not_delivered(importing: Importing) -> None:
-    importing.send(1, written=0)
-    importing.cycle(MAX_AGE)
+    importing.deliver(MAX_AGE, 1, written=0)
     assert importing.counts() == {"taken": 1}
-    importing.send(2, written=1)
-    importing.cycle(MAX_AGE + 8)
+    importing.deliver(MAX_AGE + 8, 2, written=1)
     assert importing.counts() == {"taken": 1, "late": 1}
     assert importing.read(MAX_AGE + 16)[1] == 1
 
@@ -156,13 +150,8 @@ def test_only_the_newest_of_several_messages_is_delivered(importing: Importing) 
         importing.send(number, written=number)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 5, False)
-    assert importing.counts() == {
-        "taken": 1,
-        "missing": 1,
-        "disordered": 1,
-        "repeated": 2,
-        "superseded": 1,
-    }
+    once = dict.fromkeys(("taken", "missing", "disordered", "superseded"), 1)
+    assert importing.counts() == {**once, "repeated": 2}
     assert importing.read(17)[0] is OLD
 
 
@@ -184,23 +173,16 @@ def test_a_message_of_another_mailbox_is_refused(importing: Importing) -> None:
     assert importing.read(16) == (NEW, 4, False)
 
 
-def test_the_count_of_missing_messages_saturates(
-    importing: Importing,
-) -> None:
+def test_the_count_of_missing_messages_saturates(importing: Importing) -> None:
     for number in (1, 1 << 32, (1 << 62) - 1):
         importing.send(number, written=2)
         importing.cycle(8)
-    assert (importing.status.import_other["taken"], importing.status.import_other["missing"]) == (
-        3,
-        (1 << 32) - 1,
-    )
+    status = importing.status.import_other
+    assert (status["taken"], status["missing"]) == (3, (1 << 32) - 1)
 
 
-def test_a_lost_rack_stays_lost_until_its_next_message(
-    importing: Importing,
-) -> None:
-    importing.send(1, written=2)
-    importing.cycle(8)
+def test_a_lost_rack_stays_lost_until_its_next_message(importing: Importing) -> None:
+    importing.deliver(8, 1, written=2)
     assert importing.read(16) == (NEW, 1, False)
     importing.peer.remove_token(LAUNCH, 16)
     importing.peer.mark_lost(16)
@@ -208,12 +190,10 @@ def test_a_lost_rack_stays_lost_until_its_next_message(
     lost_from = 24 if importing.grid.is_lockstep else 16
     assert importing.read(lost_from - 1)[2] is (lost_from <= 15)
     assert importing.read(lost_from) == (OLD, 1, True)
-    importing.peer.add_token(LAUNCH, 24)
-    importing.peer.offset_ns = 0
+    importing.come(LAUNCH, 24)
     importing.cycle(24)
     assert importing.read(32) == (OLD, 1, True)
-    importing.send(2, written=30)
-    importing.cycle(32)
+    importing.deliver(32, 2, written=30)
     assert importing.read(39) == (OLD, 1, True)
     assert importing.read(40) == (NEW, 2, False)
 
@@ -221,18 +201,14 @@ def test_a_lost_rack_stays_lost_until_its_next_message(
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
 def test_with_go_on_levels_keep_the_last_message_however_old(segment: Segment) -> None:
     importing = Importing(segment, goes_on=True)
-    importing.peer.add_token(LAUNCH, 0)
-    importing.peer.offset_ns = 0
-    importing.send(1, written=2)
-    importing.cycle(8)
+    importing.come(LAUNCH, 0)
+    importing.deliver(8, 1, written=2)
     importing.peer.mark_lost(16)
     importing.cycle(16)
     assert importing.read(24) == (NEW, 1, False)
     assert importing.read(10 * MAX_AGE) == (OLD, 1, False)
-    importing.peer.add_token(NEXT, 10 * MAX_AGE)
-    importing.peer.offset_ns = 0
-    importing.send(1, written=10 * MAX_AGE, launch=NEXT, count=5)
-    importing.cycle(10 * MAX_AGE + 8)
+    importing.come(NEXT, 10 * MAX_AGE)
+    importing.deliver(10 * MAX_AGE + 8, 1, written=10 * MAX_AGE, launch=NEXT, count=5)
     # From here on by its age again.
     assert importing.read(10 * MAX_AGE + 16) == (NEW, 5, False)
     assert importing.read(11 * MAX_AGE + 1) == (OLD, 5, True)
@@ -245,28 +221,23 @@ def test_a_restarted_adapter_continues_and_takes_nothing_twice(importing: Import
     assert importing.read(16) == (NEW, 2, False)
     importing.restart(8)
     # Somebody has come, so the newest is sent again; one is lost meanwhile.
-    importing.send(2, written=2)
-    importing.cycle(16)
+    importing.deliver(16, 2, written=2)
     assert importing.read(24) == (OLD, 2, False)
-    importing.send(4, written=4)
-    importing.cycle(24)
+    importing.deliver(24, 4, written=4)
     assert importing.read(32) == (NEW, 4, False)
     assert importing.counts() == {"taken": 2, "superseded": 1, "repeated": 1, "missing": 1}
     assert importing.status.import_other["serial"] == 4
 
 
 def test_an_adapter_restarted_while_a_rack_is_lost_knows_that_it_is(importing: Importing) -> None:
-    importing.send(1, written=2)
-    importing.cycle(8)
+    importing.deliver(8, 1, written=2)
     importing.peer.mark_lost(16)
     importing.cycle(16)
     importing.restart(16)
-    importing.peer.add_token(LAUNCH, 24)
-    importing.peer.offset_ns = 0
+    importing.come(LAUNCH, 24)
     importing.cycle(24)
     assert importing.read(32) == (NEW, 1, True)
-    importing.send(2, written=30)
-    importing.cycle(32)
+    importing.deliver(32, 2, written=30)
     assert importing.read(40) == (NEW, 2, False)
 
 
@@ -275,23 +246,18 @@ def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(
     importing: Importing,
 ) -> None:
     peer = importing.peer
-    importing.send(900, written=2)
-    importing.cycle(8)
+    importing.deliver(8, 900, written=2)
     assert importing.read(16) == (NEW, 900, False)
     # Its first message comes before its token.
-    importing.send(1, written=14, launch=NEXT, count=5)
-    importing.cycle(16)
+    importing.deliver(16, 1, written=14, launch=NEXT, count=5)
     assert importing.counts() == {"taken": 1}
-    peer.add_token(NEXT, 24)
-    peer.offset_ns = 0
+    importing.come(NEXT, 24)
     importing.cycle(24)
     assert importing.read(32) == (NEW, 5, False)
     # Of the old launch, whose token has not expired yet, and after it has.
-    importing.send(901, written=30)
-    importing.cycle(32)
+    importing.deliver(32, 901, written=30)
     peer.remove_token(LAUNCH, 40)
-    importing.send(902, written=38)
-    importing.cycle(40)
+    importing.deliver(40, 902, written=38)
     assert importing.read(48) == (OLD, 5, False)
     assert importing.counts() == {"taken": 2, "unknown_launch": 2}
 
@@ -313,8 +279,7 @@ def test_messages_of_a_launch_whose_token_never_comes_are_bounded_and_forgotten(
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
 def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importing) -> None:
     importing.peer.offset_ns = None
-    importing.send(1, written=2)
-    importing.cycle(8)
+    importing.deliver(8, 1, written=2)
     assert importing.counts() == {}
     importing.peer.offset_ns = 0
     importing.cycle(16)
@@ -323,31 +288,23 @@ def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importin
 
 
 @pytest.mark.parametrize("segment", ["lockstep"], indirect=True)
-def test_in_lockstep_nothing_that_differs_between_runs_is_recorded(
-    importing: Importing,
-) -> None:
-    importing.send(1, written=2)
-    importing.cycle(8)
+def test_in_lockstep_nothing_that_differs_between_runs_is_recorded(importing: Importing) -> None:
+    importing.deliver(8, 1, written=2)
     assert importing.read(16) == (NEW, 1, False)
     assert importing.status.import_other["launch"] == 0
 
 
 def test_a_clock_that_is_ahead_makes_nothing_younger_than_now(importing: Importing) -> None:
-    importing.send(1, written=100_000, stamp_ns=importing.grid.time_ns(100_000))
-    importing.cycle(8)
+    importing.deliver(8, 1, written=100_000, stamp_ns=importing.grid.time_ns(100_000))
     assert importing.status.import_other["age"] == 0
     assert importing.read(16) == (NEW, 1, False)
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_a_message_from_before_the_first_tick_keeps_its_age(
-    importing: Importing,
-) -> None:
-    importing.send(1, written=-20)
-    importing.cycle(8)
+def test_a_message_from_before_the_first_tick_keeps_its_age(importing: Importing) -> None:
+    importing.deliver(8, 1, written=-20)
     assert importing.status.import_other["age"] == 28
-    importing.send(2, written=-MAX_AGE)
-    importing.cycle(16)
+    importing.deliver(16, 2, written=-MAX_AGE)
     assert importing.counts() == {"taken": 1, "late": 1}
 
 

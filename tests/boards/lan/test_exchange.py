@@ -16,7 +16,7 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Demand, System, encode_switch
+from rack.backplane.words import Block, Demand, System
 from rack.boards import Rack
 from rack.boards.config.loader import load_text
 from rack.boards.crate.clean import remove_dead_rack
@@ -236,12 +236,3 @@ def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(
     # Of the messages written meanwhile only the newest was sent: it sampled fewer, and none twice.
     assert (np.diff(rows) >= 0).all()
     assert 40 < ended[0][1] == rows[-1]
-
-
-def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
-    """Run a rack whose adapter switches its demand at a tick; return ticks and texts of what the
-    arm must do."""
-    with rack:
-        rack.segment.words[System.PEER_STOP] = encode_switch(demand_from, is_on)
-        rack.run(0.5)
-    return [(event.tick, event.text) for event in rack.events if event.code == "demand"]

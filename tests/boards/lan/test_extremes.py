@@ -36,10 +36,9 @@ from tests.test_brown_network import configs
 
 pytestmark = pytest.mark.thorough
 
-FOLDER = CONFIGS / "cell"
-ORDER = "rack.levels.systems.coordination.messages:CellOrder"
-REPORT = "rack.levels.systems.coordination.messages:CellReport"
-BODIES = "rack.levels.systems.coordination.shared_bodies:SharedBodies"
+COORDINATION = "rack.levels.systems.coordination"
+ORDER, REPORT = f"{COORDINATION}.messages:CellOrder", f"{COORDINATION}.messages:CellReport"
+BODIES = f"{COORDINATION}.shared_bodies:SharedBodies"
 JOINT_BOARDS = "rack.levels.systems.joint_boards"
 BROWN = {
     "rack.levels.messages:TaskStatus",
@@ -89,7 +88,6 @@ class Stream(NamedTuple):
         return sum(cycles for cycles, (_, _, is_permitted) in self.rows if not is_permitted)
 
     def text(self, slot: int) -> str:
-        """Return its board and its export."""
         board, port = self.mailbox.split(".")
         # The plain one last: it is sent until all have ended.
         rows = [[cycles, message.hex()] for cycles, (_, message, _) in (*self.rows, self.rows[0])]
@@ -119,8 +117,7 @@ class Sender(NamedTuple):
         """Simulated time of all that it sends."""
         return max(sum(cycles for cycles, _ in one.rows) / one.rate_hz for one in self.streams)
 
-    def text(self, port: int, peer: str, peers: Sequence[int]) -> str:
-        """Return its config."""
+    def text(self, port: int, peer: str, connect: Sequence[str]) -> str:
         return f"""
 format = 2
 name = "{self.rack}"
@@ -136,34 +133,35 @@ slot = 2
 rate_hz = {self.rate_hz}
 listen = ["tcp/127.0.0.1:{port}"]
 insecure = true
-connect = {json.dumps([f"tcp/127.0.0.1:{at}" for at in peers])}
+connect = {json.dumps(connect)}
 peers = ["{peer}"]
 {"".join(one.text(slot) for slot, one in enumerate(self.streams, 3))}"""
 
 
-def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
+def real(file: str, name: str, folder: Path) -> RackConfig:
     """Return the config of a shipped rack under a name of its own, where `cell` stands in its
     name."""
-    for path in FOLDER.glob("*.toml"):
+    for path in (CONFIGS / "cell").glob("*.toml"):
         text = re.sub(r'"cell(?=["/-])', f'"{name}', path.read_text().replace('"../', '"'))
         (folder / path.name).write_text(text)
-    return listening(folder / f"{file}.toml", listen)
+    return listening(folder / f"{file}.toml")
 
 
-def listening(path: Path, listen: int) -> RackConfig:
+def listening(path: Path) -> RackConfig:
     """Return a config in lockstep, with a network of nobody but those that connect to it."""
-    endpoint = f'listen=["tcp/127.0.0.1:{listen}"]'
+    endpoint = f'listen=["tcp/127.0.0.1:{find_free_port()}"]'
     own = (endpoint, "insecure=true", "connect=[]", "launch=[]", "estop_from=[]")
     lan = (f"adapter.lan.{setting}" for setting in own)
     return load(path, ["clock.mode=lockstep", *lan])
 
 
-def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) -> Ended:
+def run(rack: RackConfig, senders: Sequence[Sender], folder: Path) -> Ended:
     """Run a rack with those that stand in for the others, until they have sent everything."""
+    assert rack.adapter.lan is not None
     found = [rack]
     for k, sender in enumerate(senders):
         path = folder / f"sender-{k}.toml"
-        path.write_text(sender.text(find_free_port(), rack.name, [listen]))
+        path.write_text(sender.text(find_free_port(), rack.name, rack.adapter.lan.listen))
         found.append(load(path))
     seconds = max(sender.seconds for sender in senders) + 1.0
     return run_together(found, [seconds] * len(found))[0]
@@ -173,24 +171,18 @@ def check(found: Ended, counts: Mapping[str, int]) -> None:
     """All boards live, no stop is latched, and exactly what no type permits is refused, import by
     import."""
     assert not found.outcome.faults, found.texts
-    assert not [event.text for event in found.events if event.kind in ("died", "detection")], (
-        found.texts
-    )
+    assert not {event.kind for event in found.events} & {"died", "detection"}, found.texts
     imports = {port: found.last["lan.status"][f"import_{port}"] for port in counts}
     assert {port: int(entry["refused"]) for port, entry in imports.items()} == counts
     assert all(entry["taken"] > 0 for entry in imports.values())
 
 
 def test_every_type_that_shipped_racks_import_is_tested() -> None:
-    texts = [path.read_text() for path in CONFIGS.rglob("*.toml")]
-    found = [
-        re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text)
-        for text in texts
-    ]
+    text = "\n".join(path.read_text() for path in CONFIGS.rglob("*.toml"))
+    found = re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text)
     # Extreme meetings: tests/levels/systems/trajectory/test_meeting.py.
     meeting = "rack.levels.systems.trajectory.meeting:Meeting"
-    tried = {ORDER, REPORT, BODIES, meeting} | BROWN
-    assert {name for names in found for name in names} == tried
+    assert set(found) == {ORDER, REPORT, BODIES, meeting} | BROWN
 
 
 def orders_and_bodies(
@@ -204,7 +196,6 @@ def orders_and_bodies(
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("action", ACTIONS)
 def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
     action: Mapping[str, Any], rack_name: str, tmp_path: Path
@@ -214,12 +205,11 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
         is_of_action = case[0].split()[0] in action
         if is_of_action or action is POSE:
             orders.append((PLANNED if is_of_action and case[2] else 1, case))
-    listen, senders = find_free_port(), orders_and_bodies(rack_name, orders, ())
-    found = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
+    senders = orders_and_bodies(rack_name, orders, ())
+    found = run(real("puma", rack_name, tmp_path), senders, tmp_path)
     check(found, {"orders": senders[0].streams[0].refused, "shared": 0})
 
 
-@pytest.mark.slow
 def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_path: Path) -> None:
     body = {
         "name": b"part",
@@ -236,18 +226,13 @@ def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_
         (one for one in found if one[0] != "bodies.position = 0.0"),
         key=lambda one: one[0].split()[0] not in first,
     )
-    listen, senders = (
-        find_free_port(),
-        orders_and_bodies(rack_name, (), [(5, one) for one in tried]),
-    )
-    ended = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
+    senders = orders_and_bodies(rack_name, (), [(5, one) for one in tried])
+    ended = run(real("puma", rack_name, tmp_path), senders, tmp_path)
     check(ended, {"orders": 0, "shared": senders[1].streams[0].refused})
 
 
-@pytest.mark.slow
 def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Path) -> None:
-    listen = find_free_port()
-    cell = real("cell", rack_name, tmp_path, listen)
+    cell = real("cell", rack_name, tmp_path)
     checksum = CellProgram.model_validate(resolve(cell).config.task).checksum
     answer = {"program": checksum, "echo": 1000}
     rows = [
@@ -261,7 +246,7 @@ def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Pat
         Sender(f"{rack_name}-{arm}", [Stream("task.report", REPORT, 10, [(2, c) for c in rows])])
         for arm in ("puma", "k1607")
     ]
-    found = run(cell, listen, senders, tmp_path)
+    found = run(cell, senders, tmp_path)
     refused = senders[0].streams[0].refused
     check(found, {"puma": refused, "k1607": refused})
 
@@ -283,8 +268,7 @@ def brown(
     """Run a rack of brown with one that stands in for the other and sends what that one does;
     return how it ended, and how many messages it had to refuse, by port."""
     configs(rack_name, folder)
-    listen = find_free_port()
-    rack = listening(folder / f"{file}.toml", listen)
+    rack = listening(folder / f"{file}.toml")
     assert rack.adapter.lan is not None
     sizes = compute_cell_sizes(rack)
     streams = {
@@ -297,7 +281,7 @@ def brown(
         for port, entry in rack.adapter.lan.imports.items()
     }
     sender = Sender(other, list(streams.values()), ["robots/puma560.toml"], 100.0)
-    found = run(rack, listen, [sender], folder)
+    found = run(rack, [sender], folder)
     return found, {port: stream.refused for port, stream in streams.items()}
 
 
@@ -320,7 +304,6 @@ def asked_of_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]
         }[mailbox]
 
 
-@pytest.mark.slow
 def test_no_extreme_of_the_general_machine_ends_a_board_of_the_servo_rack(
     rack_name: str, tmp_path: Path
 ) -> None:
@@ -350,15 +333,10 @@ def told_by_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]]
                 "position": cell.home,
                 "target": cell.home,
             },
-            "world.model": {
-                "revision": 1,
-                "quaternion": (1.0, 0.0, 0.0, 0.0),
-                "sensed": 20 * cycle,
-            },
+            "world.model": {"revision": 1, "quaternion": (1, 0, 0, 0), "sensed": 20 * cycle},
         }.get(mailbox, {})
 
 
-@pytest.mark.slow
 def test_no_extreme_of_the_servo_rack_ends_a_board_of_the_general_machine(
     rack_name: str, tmp_path: Path
 ) -> None:

@@ -49,16 +49,12 @@ def home(**table: Any) -> Iterator[Program]:
         yield program
 
 
-def test_nothing_listens_unless_the_config_says_so() -> None:
-    with home(peers=["friend"]) as program:
+@pytest.mark.parametrize("listens", [False, True])
+def test_it_listens_only_where_the_config_says_and_sends_no_datagram(listens: bool) -> None:
+    end = f"tcp/127.0.0.1:{find_free_port()}"
+    with home(peers=["friend"], listen=[end] * listens) as program:
         assert program.state()["came"] == {}
-        assert list(sockets(program.pid)) == []
-
-
-def test_it_listens_where_the_config_says_and_sends_no_datagram() -> None:
-    with home(listen=[f"tcp/127.0.0.1:{find_free_port()}"]) as program:
-        assert program.state()["came"] == {}
-        assert list(sockets(program.pid)) == [("tcp", LISTENS)]
+        assert list(sockets(program.pid)) == [("tcp", LISTENS)] * listens
 
 
 def test_a_unix_socket_is_reached_by_its_own_user_alone(
@@ -89,7 +85,6 @@ def test_opening_waits_for_no_peer() -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """A rack over TLS at home."""
     with at_home(tmp_path_factory.mktemp("site")) as site:
         yield site
 
@@ -104,13 +99,9 @@ def crowd(site: Site, stack: ExitStack) -> None:
 
 def test_failing_handshakes_do_not_disturb_connected_racks(site: Site) -> None:
     with ExitStack() as stack, running("strangers", json.dumps({"friend": friend(site)})) as others:
-        wait_until(
-            lambda: (
-                others.state()["friend"]["heard"]
-                and "friend came" in site.home.state()["tokens"]
-                and site.home.state()["good"].get(PULSE)
-            )
-        )
+        wait_until(lambda: others.state()["friend"]["heard"])
+        wait_until(lambda: "friend came" in site.home.state()["tokens"])
+        wait_until(lambda: site.home.state()["good"].get(PULSE))
         before = site.home.state()["tokens"]
         crowd(site, stack)
         good, heard = site.home.state()["good"][PULSE], others.state()["friend"]["heard"][OWN]
@@ -128,10 +119,8 @@ def test_during_failing_handshakes_a_rack_can_connect_outwards(site: Site) -> No
     outside["settings"] |= listening
     with ExitStack() as stack:
         crowd(site, stack)
-        came, good = (
-            site.home.state()["tokens"].count("friend came"),
-            site.home.state()["good"].get(PULSE, 0),
-        )
+        before = site.home.state()
+        came, good = before["tokens"].count("friend came"), before["good"].get(PULSE, 0)
         others = stack.enter_context(running("strangers", json.dumps({"friend": outside})))
         wait_until(lambda: others.state()["friend"]["heard"])
         wait_until(lambda: site.home.state()["good"].get(PULSE, 0) > good + 10)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import load, resolve_layout
 from rack.boards.lan.credentials import Credentials
@@ -21,24 +20,31 @@ from rack.boards.lan.remote_estop import CHECK_FLAG, ESTOP_KIND, EstopResponder
 from rack.levels.level import Finding
 from rack.tools.network.certificates import make_credentials
 from tests.boards.commanded_racks import COMMANDED
+from tests.boards.lan.conftest import MakeSegment
 
 LAUNCH, SESSION = 77, 5
 ASKERS = {"operator": 1, "second": 2}
 
 
-class Line:
-    """A link whose requests a test sends; answers are opened as an operator does."""
+class Bench:
+    """A desk at the segment of a rack that is not running, and its link: tests send requests, and
+    answers are opened as an operator does."""
 
-    def __init__(self, rack: str) -> None:
-        self.rack, self.sealer = rack, Sealer()
-        self.most = 0
-        self.answers: list[Envelope] = []
+    def __init__(self, segment: Segment) -> None:
+        self.segment, self.rack, self.tick = segment, segment.rack, 40
+        self.findings: list[Finding] = []
+        self.desk = EstopResponder(segment, OwnGrid(segment, 8), ASKERS, self.findings)
+        self.sealer = Sealer()
+        self._answers: list[Envelope] = []
         self._waiting: list[Question] = []
         self._number = 0
+        self.open()
+
+    def open(self) -> None:
+        self.desk.open(self, LAUNCH)  # type: ignore[arg-type]
 
     def open_questions(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
         assert key == estop_key("*", self.rack)
-        self.most = unread
 
         def take() -> Iterator[Question]:
             found, self._waiting = self._waiting, []
@@ -57,9 +63,9 @@ class Line:
     ) -> None:
         """Send a request, by default a proper one."""
         self._number += 1
-        key = estop_key(asker, self.rack)
+        key = sealed_for or estop_key(asker, self.rack)
         head = Envelope(kind, SESSION, self._number, 0, 0, 0, 0, flags)
-        self.put(asker, self.sealer.seal(sealed_for or key, head, payload), payload)
+        self.put(asker, self.sealer.seal(key, head, payload), payload)
 
     def put(self, asker: str, envelope: bytes | None, payload: bytes = b"") -> None:
 
@@ -68,32 +74,17 @@ class Line:
             head = self.sealer.open_message(key, attachment, payload)
             assert isinstance(head, Envelope)
             assert payload == b""
-            self.answers.append(head)
+            self._answers.append(head)
 
-        self._waiting.append(
-            Question(ReceivedMessage(estop_key(asker, self.rack), envelope, payload), reply)
-        )
-
-
-class Bench:
-    """A desk at the segment of a rack that is not running."""
-
-    def __init__(self, segment: Segment) -> None:
-        self.segment, self.findings, self.tick = segment, list[Finding](), 40
-        self.desk = EstopResponder(segment, OwnGrid(segment, 8), ASKERS, self.findings)
-        self.line = Line(segment.rack)
-        self.open()
-
-    def open(self) -> None:
-        """Let the desk take requests from the line."""
-        self.desk.open(self.line, LAUNCH)  # type: ignore[arg-type]
+        message = ReceivedMessage(estop_key(asker, self.rack), envelope, payload)
+        self._waiting.append(Question(message, reply))
 
     def cycle(self) -> list[Envelope]:
         """Let the desk have a cycle; return its answers."""
         self.tick += 8
-        self.line.answers.clear()
+        self._answers = []
         self.desk.answer_requests(self.tick)
-        return list(self.line.answers)
+        return self._answers
 
     @property
     def is_stopped(self) -> bool:
@@ -105,27 +96,16 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    name = f"test-desk-{os.getpid()}"
+def bench(make_segment: MakeSegment, rack_name: str, tmp_path: Path) -> Bench:
     path = tmp_path / "rack.toml"
     path.write_text(COMMANDED)
-    segment = Segment.create(
-        resolve_layout(load(path, [f"name={name}", "clock.mode=realtime"])), ""
-    )
-    try:
-        # A rack's clock has set these before the first cycle of a board.
-        segment.words[System.PERIOD_NS] = 2_500_000
-        yield Bench(segment)
-    finally:
-        segment.close()
-        unlink_segment(name)
+    config = load(path, [f"name={rack_name}", "clock.mode=realtime"])
+    return Bench(make_segment(resolve_layout(config)))
 
 
-def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(
-    bench: Bench,
-) -> None:
+def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(bench: Bench) -> None:
     for asker in ("second", "operator"):
-        bench.line.ask(asker)
+        bench.ask(asker)
     answers = bench.cycle()
     assert [(head.number, head.serial, head.launch, head.tick) for head in answers] == [
         (SESSION, 1, LAUNCH, bench.tick),
@@ -139,21 +119,20 @@ def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(
 
 
 def test_a_check_is_answered_and_sets_nothing(bench: Bench) -> None:
-    bench.line.ask(flags=CHECK_FLAG)
+    bench.ask(flags=CHECK_FLAG)
     assert len(bench.cycle()) == 1
     assert not bench.is_stopped
     assert not bench.findings
 
 
 def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: Bench) -> None:
-    line = bench.line
-    line.ask("nobody")
-    line.ask(payload=b"x")
-    line.ask(kind=ESTOP_KIND + 1)
-    line.ask(sealed_for=estop_key("second", line.rack))
-    line.ask(sealed_for=estop_answer_key(line.rack, "operator"))
-    line.put("operator", None)
-    line.put("operator", b"RLN1")
+    bench.ask("nobody")
+    bench.ask(payload=b"x")
+    bench.ask(kind=ESTOP_KIND + 1)
+    bench.ask(sealed_for=estop_key("second", bench.rack))
+    bench.ask(sealed_for=estop_answer_key(bench.rack, "operator"))
+    bench.put("operator", None)
+    bench.put("operator", b"RLN1")
     assert bench.cycle() == []
     assert not bench.is_stopped
     assert bench.counts == (0, 1, 6)
@@ -163,25 +142,23 @@ def test_nobody_can_request_a_stop_under_another_name(bench: Bench, tmp_path: Pa
     names = (bench.segment.rack, *ASKERS)
     make_credentials(tmp_path, dict.fromkeys(names, ()), 1)
     rack, operator, second = (Sealer(Credentials(tmp_path, name)) for name in names)
-    bench.line.sealer = rack
+    bench.sealer = rack
     bench.open()
-    bench.line.sealer = second
-    bench.line.ask("operator")
+    bench.sealer = second
+    bench.ask("operator")
     assert bench.cycle() == []
     assert (bench.is_stopped, bench.counts) == (False, (0, 0, 1))
-    bench.line.sealer = operator
-    bench.line.ask("operator")
-    # The answer has the seal of the rack, which `Line` checks.
+    bench.sealer = operator
+    bench.ask("operator")
+    # The answer has the seal of the rack, which `Bench` checks.
     assert len(bench.cycle()) == 1
     assert bench.is_stopped
 
 
-def test_counters_continue_after_a_restart_and_are_empty_in_lockstep(
-    bench: Bench,
-) -> None:
+def test_counters_continue_after_a_restart_and_are_empty_in_lockstep(bench: Bench) -> None:
     group = np.zeros((), [("answered", "u4"), ("refused", "u4"), ("dropped", "u4")])
-    bench.line.ask()
-    bench.line.ask("nobody")
+    bench.ask()
+    bench.ask("nobody")
     bench.cycle()
     bench.desk.write_counts(group)
     assert group.tolist() == (1, 1, 0)

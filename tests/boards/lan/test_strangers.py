@@ -21,6 +21,8 @@ from rack.tools.network.certificates import make_credentials
 from rack.tools.viewer.window import find_free_port
 from tests.processes import BOUND_S, wait_until
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 IMPORTED = (
     "friend/pulse.status",
@@ -70,7 +72,6 @@ class Program:
 
 @contextmanager
 def running(module: str, *arguments: str) -> Iterator[Program]:
-    """Run a program until the end of the block."""
     program = Program(module, *arguments)
     try:
         yield program
@@ -134,72 +135,46 @@ def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """The rack at home."""
     with at_home(tmp_path_factory.mktemp("site")) as site:
         yield site
 
 
+def sealing(site: Site, name: str, **more: Any) -> dict[str, Any]:
+    """Return a session with certificate and seals of a name."""
+    return {"settings": site.mutual(name), "seals": site.seals(name), **more}
+
+
 def friend(site: Site) -> dict[str, Any]:
     """Return the session of a rack that does nothing wrong."""
-    return {
-        "settings": site.mutual("friend"),
-        "seals": site.seals("friend"),
-        "puts": [(pulse("friend"), 100, pulse("friend"))],
-        "listens": [OWN],
-        "asks": [FRIENDS_STOP],
-        "token": "rack/friend/alive/0000000000000009",
-    }
+    puts, token = [(pulse("friend"), 100, pulse("friend"))], "rack/friend/alive/0000000000000009"
+    return sealing(site, "friend", puts=puts, listens=[OWN], asks=[FRIENDS_STOP], token=token)
 
 
 def sessions(site: Site) -> dict[str, dict[str, Any]]:
     """Return a friend's session and those of strangers."""
     # Even with a seal of the one in whose name they come.
-    eager = {
-        "seals": site.seals("friend"),
-        "puts": [(pulse("friend"), 99, pulse("friend"))],
-        "listens": ["**", OWN],
-        "asks": [STRANGER],
-    }
+    puts = [(pulse("friend"), 99, pulse("friend"))]
+    eager = {"seals": site.seals("friend"), "puts": puts, "listens": ["**", OWN]}
+    eager["asks"] = [STRANGER]
     own = [(pulse(name), 99, pulse(name)) for name in ("nobody", "viewer", "home")]
     liar, second = pulse("liar"), out_key("liar", "second.status")
-    lies = [
-        (liar, 100, None),
-        (liar, MAX_MESSAGE_BYTES + 1, liar),
-        (second, 100, liar),
-        *eager["puts"],
-        *own,
-    ]
+    lies = [(liar, 100, None), (liar, MAX_MESSAGE_BYTES + 1, liar), (second, 100, liar)]
     heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
     impostor = site.mutual("impostor") | {"connect/endpoints": []}
     impostor["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
     asks = [STOP, FRIENDS_STOP, "rack/*/estop/home", "rack/viewer/estop/other"]
+    nobody = {**eager, "settings": site.mutual("nobody"), "puts": [*puts, *own]}
+    mole = [(pulse("mole"), 9, pulse("mole"))]
     return {
         "friend": friend(site),
         "bare": {"settings": site.bare("tls"), "fails": True, **eager},
         "plain": {"settings": site.bare("tcp"), "fails": True, **eager},
         "forged": {"settings": site.mutual("friend", "forged"), "fails": True, **eager},
-        "nobody": {"settings": site.mutual("nobody"), **eager, "puts": [*eager["puts"], *own]},
-        "viewer": {
-            "settings": site.mutual("viewer"),
-            **eager,
-            "puts": [*eager["puts"], *own],
-            "asks": asks,
-        },
-        "liar": {
-            "settings": site.mutual("liar"),
-            "seals": site.seals("liar"),
-            "puts": [*lies, (liar, 100, liar)],
-        },
-        "mole": {
-            "settings": site.mutual("mole"),
-            "puts": [(pulse("mole"), 9, pulse("mole"))],
-            "seals": site.seals("mole", "forged"),
-        },
-        "heavy": {
-            "settings": site.mutual("heavy"),
-            "seals": site.seals("heavy"),
-            "puts": heavy,
-        },
+        "nobody": nobody,
+        "viewer": {**nobody, "settings": site.mutual("viewer"), "asks": asks},
+        "liar": sealing(site, "liar", puts=[*lies, *puts, *own, (liar, 100, liar)]),
+        "mole": sealing(site, "mole", puts=mole) | {"seals": site.seals("mole", "forged")},
+        "heavy": sealing(site, "heavy", puts=heavy),
         "impostor": {"settings": impostor, **eager},
     }
 
@@ -235,14 +210,12 @@ def found(site: Site) -> Found:
 NOTHING = {"heard": {}, "tokens": {}, "answers": {}}
 
 
-@pytest.mark.slow
 def test_a_permitted_rack_is_heard_answered_and_sees_who_is_present(found: Found) -> None:
     assert found.home["good"][pulse("friend")] == found.home["came"][pulse("friend")]
     assert set(found.of["friend"]["tokens"]) >= {TOKEN}
     assert "friend came" in found.home["tokens"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "connected"),
     # The impostor's certificate is ours, but for another address.
@@ -254,7 +227,6 @@ def test_nobody_gets_anything_without_a_certificate_and_a_right(
     assert found.of[name] == {**NOTHING, "connected": connected}
 
 
-@pytest.mark.slow
 def test_an_operator_may_only_stop_the_rack_and_nobody_else_may(found: Found) -> None:
     viewer = found.of["viewer"]
     assert set(viewer["answers"]) == {STOP}
@@ -264,7 +236,6 @@ def test_an_operator_may_only_stop_the_rack_and_nobody_else_may(found: Found) ->
     assert set(found.home["asked"]) == {STOP, FRIENDS_STOP}
 
 
-@pytest.mark.slow
 def test_wrong_names_wrong_seals_and_oversized_messages_are_refused(found: Found) -> None:
     home, second, heavy = found.home, out_key("liar", "second.status"), pulse("heavy")
     # Friend sends 100 bytes, all others 99 under its key: those would be good.
@@ -281,7 +252,6 @@ def test_wrong_names_wrong_seals_and_oversized_messages_are_refused(found: Found
     assert home["sizes"][heavy] == [100]
 
 
-@pytest.mark.slow
 def test_a_permitted_rack_can_connect_over_quic(tmp_path: Path) -> None:
     with at_home(tmp_path, "quic") as site:
         settings = site.mutual("friend") | {"connect/endpoints": [f"quic/127.0.0.1:{site.port}"]}

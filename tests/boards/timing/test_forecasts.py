@@ -20,17 +20,17 @@ from rack.boards.timing.tasks import Budget
 from tests.snapshots import QUICK, ROOT, SHIPPED, Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
-SHARES = (0.3,)
-"""Heavy budgets, beside the config's own: shares of a cycle that a part takes, about."""
+SHARE = 0.3
+"""Heavy budgets, beside the config's own: the share of a cycle that a part takes, about."""
 PERIODS = 3
 
 
-def budgets(rack: RackTiming, share: float) -> dict[str, Budget]:
+def budgets(rack: RackTiming) -> dict[str, Budget]:
     """Return budgets for all boards, each another."""
     found = {}
     for at, (name, board) in enumerate(rack.boards.items(), 1):
         cycle_ns = board.every * rack.clock_ns
-        part = round(share * cycle_ns / (at + 3))
+        part = round(SHARE * cycle_ns / (at + 3))
         plan = part * board.within_cycles if board.has_planner else 0
         found[name] = Budget(
             read_ns=part // 2 + at,
@@ -44,19 +44,16 @@ def budgets(rack: RackTiming, share: float) -> dict[str, Budget]:
 
 
 def model(rack: RackTiming) -> Iterable[object]:
-    """Return all that the model says."""
     cycles_ns = [task.every_ns * task.within_cycles for task in rack.tasks]
     until_ns = PERIODS * max(cycles_ns, default=rack.clock_ns)
     chart = simulate_schedule(rack.tasks, min(until_ns, 2_000_000_000), rack.context_switch_ns)
+    responses = compute_task_responses(rack.tasks, rack.context_switch_ns)
     return [
         Forecast.from_rack(rack).to_document(),
         Forecast.from_rack(rack, has_cores=False).notes,
         rack.tasks,
         [frames.to_document() for frames in compute_core_frames(rack)],
-        {
-            found.task: found.response_ns
-            for found in compute_task_responses(rack.tasks, rack.context_switch_ns)
-        },
+        {found.task: found.response_ns for found in responses},
         compute_loads(rack.tasks, rack.context_switch_ns),
         chart,
         chart.cut_window(until_ns // 5, until_ns // 2),
@@ -79,7 +76,5 @@ def test_the_timing_of_a_shipped_rack_is_as_before(
     plan = resolve(load(ROOT / "configs" / name))
     rack = build_rack_timing(plan.config, plan.layout)
     parts: dict[str, object] = {"own": model(rack), "paths": find_command_paths(rack, plan.layout)}
-    for share in SHARES:
-        found = build_rack_timing(plan.config, plan.layout, budgets(rack, share))
-        parts[f"share {share:g}"] = model(found)
+    parts[f"share {SHARE:g}"] = model(build_rack_timing(plan.config, plan.layout, budgets(rack)))
     SNAPSHOTS.check(name, parts)

@@ -31,14 +31,11 @@ def test_a_board_still_running_when_the_next_begins_has_negative_slack_and_fails
     rack = timing("board.fast.budget.process_ms=1.1")
     even, odd = compute_core_frames(rack)
     assert places(even)[0] == (*places(odd)[0][:3], "even") == ("fast", 0, -0.14, "even")
-    failing = [
-        (v.subject, v.left, v.right, v.meaning)
-        for v in evaluate_rack(rack)
-        if v.equation == FRAMES and not v.holds
-    ]
-    assert failing == [
-        ("fast", 1.14 * MS, 1.0 * MS, "done before 'even' begins, in frame 0"),
-        ("fast", 1.14 * MS, 1.0 * MS, "done before 'odd' begins, in frame 1"),
+    failing = [v for v in evaluate_rack(rack) if v.equation == FRAMES and not v.holds]
+    assert {(v.subject, v.left, v.right) for v in failing} == {("fast", 1.14 * MS, 1.0 * MS)}
+    assert [v.meaning for v in failing] == [
+        "done before 'even' begins, in frame 0",
+        "done before 'odd' begins, in frame 1",
     ]
 
 

@@ -19,17 +19,18 @@ MS = 1_000_000
 LOCKSTEP = "clock.mode=lockstep"
 
 
-def join(*names: str, overrides: Sequence[str] = ()) -> JoinedRacks:
-    return join_racks([load(name, overrides) for name in names])
+def join(*names: str) -> JoinedRacks:
+    return join_racks([load(name) for name in names])
+
+
+def join_brown(*settings: str) -> JoinedRacks:
+    return join_racks([load(name, settings) for name in ("brown", "brown/servo")])
 
 
 def find_path(paths: Sequence[JoinedPath], direction: str, first: str) -> JoinedPath:
     """Return the first path in a direction that begins at a board of a rack."""
-    return next(
-        path
-        for path in paths
-        if path.direction == direction and "/".join(path.stations[0]) == first
-    )
+    found = [path for path in paths if "/".join(path.stations[0]) == first]
+    return next(path for path in found if path.direction == direction)
 
 
 @pytest.mark.parametrize(
@@ -51,25 +52,14 @@ def test_a_link_takes_its_waits_its_delay_and_its_losses(
     written: TickGrid, read: TickGrid, is_lockstep: bool, max_lost: int, expected_ms: int
 ) -> None:
     grid = TickGrid(20 * MS)
-    link = RackLink(
-        Station("upper", "a"),
-        "a.command",
-        "lower",
-        "p",
-        ("b",),
-        True,
-        grid,
-        grid,
-        10 * MS,
-        5 * MS,
-        max_lost,
-    )
+    ends = Station("upper", "a"), "a.command", "lower", "p", ("b",)
+    link = RackLink(*ends, True, grid, grid, 10 * MS, 5 * MS, max_lost)
     taken_ns = link.compute_taken_ns(written, is_lockstep)
     assert taken_ns + link.compute_shown_ns(read) == expected_ms * MS
 
 
 def test_the_chains_of_two_racks_pass_from_the_upper_rack_to_the_lower_one() -> None:
-    joined = join("brown", "brown/servo", overrides=[LOCKSTEP])
+    joined = join_brown(LOCKSTEP)
     texts = [" > ".join(map(str, chain)) for chain in joined.chains]
     assert sum("brown/trajectory > brown-servo/supervisor > " in text for text in texts) == 3
     assert "brown/modifications > brown-servo/elbow > brown-servo/arm" in texts
@@ -77,7 +67,7 @@ def test_the_chains_of_two_racks_pass_from_the_upper_rack_to_the_lower_one() -> 
 
 
 def test_a_path_begins_at_the_board_whose_release_the_messages_carry() -> None:
-    joined = join("brown", "brown/servo", overrides=[LOCKSTEP])
+    joined = join_brown(LOCKSTEP)
     # Motions wait in a queue for any time, so a command carries the release of the trajectory.
     command = find_path(joined.list_paths("brown-servo"), "command", "brown/trajectory")
     assert command.boards[0] == "supervisor"
@@ -89,16 +79,12 @@ def test_a_path_begins_at_the_board_whose_release_the_messages_carry() -> None:
 
 
 def test_in_real_time_a_bound_is_longer_by_the_budget_of_the_link() -> None:
-    ways = [
-        find_path(
-            join("brown", "brown/servo", overrides=mode).list_paths("brown"),
-            "status",
-            "brown-servo/arm",
-        )
+    lockstep, real_time = (
+        find_path(join_brown(*mode).list_paths("brown"), "status", "brown-servo/arm")
         for mode in ([LOCKSTEP], [])
-    ]
+    )
     # 20 ms for the phases of both exchanges and 20 ms of delay.
-    assert ways[1].response_ms - ways[0].response_ms == pytest.approx(40.0)
+    assert real_time.response_ms - lockstep.response_ms == pytest.approx(40.0)
 
 
 def test_each_rack_of_the_cell_hears_of_the_coordinator() -> None:
@@ -123,7 +109,6 @@ def test_a_goal_of_the_upper_rack_limits_the_response() -> None:
 
 
 def load_changed_servo(folder: Path, old: str, new: str) -> RackConfig:
-    """Load a copy of brown/servo in which a text is replaced."""
     text = (CONFIGS / "brown" / "servo.toml").read_text()
     assert old in text
     path = folder / "servo.toml"

@@ -37,18 +37,8 @@ FIGURE_3 = BoardTiming(
 
 
 def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
-    return RackTiming(
-        False,
-        1.0,
-        2 * MS,
-        CLOCK,
-        {board.name: board for board in boards},
-        0,
-        0.2,
-        goal_ns,
-        {},
-        None,
-    )
+    named = {board.name: board for board in boards}
+    return RackTiming(False, 1.0, 2 * MS, CLOCK, named, 0, 0.2, goal_ns, {}, None)
 
 
 def board(name: str, every: int, above: str = "") -> BoardTiming:
@@ -56,11 +46,7 @@ def board(name: str, every: int, above: str = "") -> BoardTiming:
 
 
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
-    failing = {
-        (verdict.equation, verdict.subject)
-        for verdict in evaluate_rack(rack(FIGURE_3))
-        if not verdict.holds
-    }
+    failing = {(v.equation, v.subject) for v in evaluate_rack(rack(FIGURE_3)) if not v.holds}
     assert failing == {("3.8", "level"), ("response time", "level.planner"), ("load", "core 1")}
     # The paper's own way out: cycles of 8 ms, figure 2.
     longer = rack(FIGURE_3).replace_board("level", every=4, within_cycles=2)
@@ -97,11 +83,7 @@ def arm_of(*joints: str) -> RackTiming:
     """A board a joint between a trajectory level, which has a planner's board above it, and the
     board of the arm."""
     names = " ".join(joints)
-    boards = [
-        board("plan", 200),
-        board("path", 20, "plan"),
-        board("arm", 2, names),
-    ]
+    boards = board("plan", 200), board("path", 20, "plan"), board("arm", 2, names)
     return rack(*boards, *(board(name, 4, "path") for name in joints), board("alone", 500))
 
 
@@ -146,28 +128,19 @@ def test_a_forecast_notes_exactly_what_it_leaves_out() -> None:
     ordinary = replace(FIGURE_3, planner_priority=70)
     assert Forecast.from_rack(replace(counted, boards={"level": ordinary})).notes == ()
     notes = Forecast.from_rack(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
-    expected = (
-        "in lockstep",
-        "times are wall-clock times: speed 2",
-        "cores are those in the config",
-    )
+    expected = "in lockstep", "times are wall-clock times: speed 2", "cores are those in the config"
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
-    queued = Forecast.from_rack(
-        arm_of(*JOINTS).replace_board("path", queues=("plan.requests",))
-    ).notes
-    assert queued[0] == "the system response assumes that these queues are empty: plan.requests"
-    # Without a budget there is nothing to say about times.
-    bare = Forecast.from_rack(
-        replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
-    ).notes
-    assert bare == ()
-    # Two ordinary tasks that compute share a core; one has it to itself.
-    both = replace(FIGURE_3, priority=0, planner_priority=0)
-    assert (
-        "ordinary scheduling"
-        in Forecast.from_rack(replace(counted, boards={"level": both})).notes[-1]
+    queued = arm_of(*JOINTS).replace_board("path", queues=("plan.requests",))
+    assert Forecast.from_rack(queued).notes[0] == (
+        "the system response assumes that these queues are empty: plan.requests"
     )
+    # Without a budget there is nothing to say about times.
+    bare = replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0)
+    assert Forecast.from_rack(bare, has_cores=False).notes == ()
+    # Two ordinary tasks that compute share a core; one has it to itself.
+    both = replace(counted, boards={"level": replace(FIGURE_3, priority=0, planner_priority=0)})
+    assert "ordinary scheduling" in Forecast.from_rack(both).notes[-1]
 
 
 @pytest.mark.parametrize(

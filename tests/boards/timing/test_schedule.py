@@ -94,10 +94,8 @@ def random_tasks(seed: int) -> list[TimedTask]:
     tasks = []
     for at in range(chance.randint(1, 3)):
         every, priority = chance.randint(4, 20), chance.choice((10, 20, 30, 40))
-        text = (
-            f"R{chance.randint(0, 1)} X{chance.randint(1, max(1, every // 3))}"
-            f" W{chance.randint(0, 2)}"
-        )
+        longest = max(1, every // 3)
+        text = f"R{chance.randint(0, 1)} X{chance.randint(1, longest)} W{chance.randint(0, 2)}"
         name = f"level{at}"
         tasks.append(executor(text, every, priority, name=name))
         if chance.random() < 0.7:
@@ -133,10 +131,8 @@ def step_by_step(
             release[name] = max(free_from[name], newest - late_by[name])
             late_by[name] = (task.within_cycles - 1) * task.every_ns
             for part in task.parts:
-                units = [
-                    (part.unit.value, not part.preemptible, at > 0) for at in range(part.time_ns)
-                ]
-                todo[name] += units
+                letter, is_whole = part.unit.value, not part.preemptible
+                todo[name] += [(letter, is_whole, at > 0) for at in range(part.time_ns)]
         letter, _, _ = todo[name].pop(0)
         row.append(f"{letter} of {name}")
         if not todo[name]:
@@ -164,10 +160,8 @@ def test_a_schedule_equals_a_simulation_unit_by_unit(seed: int) -> None:
         found = ["-"] * until
         for span in chart.spans:
             assert set(found[span.start_ns : span.end_ns]) == {"-"}
-            found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * (
-                span.end_ns - span.start_ns
-            )
+            units = span.end_ns - span.start_ns
+            found[span.start_ns : span.end_ns] = [f"{span.unit.value} of {span.task}"] * units
         assert found == expected
-        assert {
-            (job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None
-        } == ended
+        done = [job for job in chart.jobs if job.end_ns is not None]
+        assert {(job.task, job.release_ns): job.end_ns for job in done} == ended

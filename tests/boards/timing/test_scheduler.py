@@ -19,13 +19,16 @@ FIXED, EARLIEST, URGENCY = Scheduler
 
 
 class Load(NamedTuple):
-    """A periodic task."""
-
     name: str
     period: int
     cost: int
     priority: int
     is_critical: bool = False
+
+    def release(self, now: int, scheduler: Scheduler) -> CoreJob:
+        due = now + self.period
+        order = scheduler, self.priority, self.is_critical
+        return CoreJob(self.name, now, *order, now, due, self.cost)
 
 
 def run(loads: Sequence[Load], scheduler: Scheduler, until: int) -> dict[tuple[str, int], int]:
@@ -33,20 +36,7 @@ def run(loads: Sequence[Load], scheduler: Scheduler, until: int) -> dict[tuple[s
     core = SimulatedCore()
     ends = {}
     for now in range(until):
-        core.jobs += [
-            CoreJob(
-                load.name,
-                now,
-                scheduler,
-                load.priority,
-                load.is_critical,
-                now,
-                now + load.period,
-                load.cost,
-            )
-            for load in loads
-            if now % load.period == 0
-        ]
+        core.jobs += [load.release(now, scheduler) for load in loads if now % load.period == 0]
         while (job := core.run_until(now + 1)) is not None:
             ends[job.task, job.release] = core.now_ns
     return ends
@@ -66,18 +56,10 @@ def test_fixed_priorities_give_the_schedule_of_the_gantt_chart(seed: int) -> Non
     # Up to this share rate-monotonic priorities meet all deadlines (Liu and Layland).
     loads = list(draw(random.Random(seed), 0.69))
     until = lcm(*(load.period for load in loads))
-    tasks = [
-        TimedTask(
-            name=load.name,
-            board=load.name,
-            role="executor",
-            core=0,
-            priority=load.priority,
-            every_ns=load.period,
-            parts=(Part(Unit.PROCESS, load.cost),),
-        )
-        for load in loads
-    ]
+    tasks = []
+    for name, period, cost, priority, _ in loads:
+        parts = (Part(Unit.PROCESS, cost),)
+        tasks.append(TimedTask(name, name, "executor", 0, priority, period, parts))
     chart = simulate_schedule(tasks, until)
     expected = {(job.task, job.release_ns): job.end_ns for job in chart.jobs}
     assert run(loads, FIXED, until) == expected
@@ -119,13 +101,10 @@ def test_the_least_laxity_counts_among_equally_critical_jobs() -> None:
     # Laxities 3, 2 and 5; the earliest deadline and the highest priority would choose otherwise.
     jobs = [Load("a", 4, 1, 1), Load("b", 6, 4, 2), Load("c", 8, 3, 3)]
     core = SimulatedCore()
-    core.jobs = [
-        CoreJob(job.name, 0, URGENCY, job.priority, False, 0, job.period, job.cost) for job in jobs
-    ]
-    order = []
-    while (ended := core.run_until(20)) is not None:
-        order.append(ended.task)
-    assert order[0] == "b"
+    core.jobs = [job.release(0, URGENCY) for job in jobs]
+    ended = core.run_until(20)
+    assert ended is not None
+    assert ended.task == "b"
 
 
 @pytest.mark.parametrize("order", list(permutations(Scheduler)))
@@ -138,7 +117,7 @@ def test_on_one_core_urgency_precedes_deadlines_and_these_precede_priorities(
         CoreJob(scheduler.word, 0, scheduler, 10 * at, False, 0, 100 - at, 5)
         for at, scheduler in enumerate(order)
     ]
-    ended = [core.run_until(100), core.run_until(100), core.run_until(100)]
+    ended = [core.run_until(100) for _ in order]
     words = [job.task for job in ended if job is not None]
     assert words == [URGENCY.word, EARLIEST.word, FIXED.word]
     assert core.run_until(100) is None
@@ -153,7 +132,5 @@ def test_a_change_of_the_scheduler_acts_on_a_job_that_has_begun() -> None:
     ]
     assert core.run_until(10) is None
     core.jobs[1].scheduler = URGENCY
-    assert [job.task for job in (core.run_until(60), core.run_until(60)) if job] == [
-        "second",
-        "first",
-    ]
+    ended = core.run_until(60), core.run_until(60)
+    assert [job.task for job in ended if job] == ["second", "first"]

@@ -12,12 +12,9 @@ from rack.boards.config import build_rack_timing, load, resolve_layout
 from rack.boards.timing.command_path import CommandPath, find_command_paths
 
 
-def path_of(
-    levels: Sequence[str], grids: Sequence[TickGrid], reads: Sequence[TickGrid] | None = None
-) -> CommandPath:
-    """Return a path whose first command takes a tick; each level reads in every cycle, or at
-    `reads`."""
-    return CommandPath(tuple(levels), tuple(grids), tuple(reads or grids), 1, True)
+def path_of(levels: Sequence[str], grids: Sequence[TickGrid]) -> CommandPath:
+    """Return a path whose first command takes a tick; each level reads in every cycle."""
+    return CommandPath(tuple(levels), tuple(grids), tuple(grids), 1, True)
 
 
 NASREM = path_of(
@@ -55,9 +52,8 @@ def test_bounds_follow_the_paper_and_the_releases() -> None:
 def test_the_longest_response_is_reached_and_never_exceeded(cycles: tuple[int, ...]) -> None:
     path = path_of([str(cycle) for cycle in cycles], [TickGrid(cycle) for cycle in cycles])
     grid = int(np.lcm.reduce(cycles))
-    found = [
-        path.find_acting_release(given + 1) + path.cycles[-1] - given for given in range(2 * grid)
-    ]
+    slice_ticks = path.cycles[-1]
+    found = [path.find_acting_release(at + 1) + slice_ticks - at for at in range(2 * grid)]
     assert max(found) <= path.longest
     if len(cycles) <= 2:
         assert max(found) == path.longest

@@ -16,12 +16,8 @@ def test_a_plan_ages_until_the_next_one_can_be_read() -> None:
     assert compute_plan_ages(executor, made, visible_at).tolist() == [*range(4, 12), *range(4, 12)]
     # A late plan is not visible before its own tick.
     made, visible_at = np.array([0, 4, 8]), np.array([4, 15, 12])
-    assert compute_plan_ages(np.array([3, 11, 12, 14, 15]), made, visible_at).tolist() == [
-        11,
-        12,
-        14,
-        7,
-    ]
+    ages = compute_plan_ages(np.array([3, 11, 12, 14, 15]), made, visible_at)
+    assert ages.tolist() == [11, 12, 14, 7]
 
 
 def test_occupied_time_within_a_stretch_equals_a_count_of_moments() -> None:

@@ -46,12 +46,9 @@ def judged(
 @pytest.mark.parametrize(
     ("left", "sign", "right", "holds"),
     [
-        (2, "<", 3, True),
-        (3, "<", 3, False),
-        (3, "<=", 3, True),
-        (4, "<=", 3, False),
-        (3, "=", 3, True),
-        (2, "=", 3, False),
+        *((2, "<", 3, True), (3, "<", 3, False)),
+        *((3, "<=", 3, True), (4, "<=", 3, False)),
+        *((3, "=", 3, True), (2, "=", 3, False)),
     ],
 )
 def test_an_equation_holds_if_its_sides_satisfy_it(

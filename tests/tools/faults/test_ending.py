@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
@@ -16,15 +18,12 @@ from rack.levels.messages import ArmState, Error, ServoStatus, TaskStatus
 from rack.tools.faults.campaigns.trial import build_external_kill, format_levels, is_late
 from rack.tools.faults.ending import EXTERNAL, REST_VELOCITY, list_strikes, read_arm
 from tests.backplane.bus import mailbox, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 
 SIZES = {"joints": 2, "state": 3}
-JOINTS = ("shoulder", "elbow")
-TASKS = task("task"), task("servo", slot=3), task("arm", slot=4)
 
 
 def box(kind: type[Message], name: str) -> MailboxSpec:
-    """Return the spec of a board's mailbox."""
     return replace(
         mailbox(name=name, writer=name.partition(".")[0]),
         readers=(),
@@ -35,11 +34,11 @@ def box(kind: type[Message], name: str) -> MailboxSpec:
     )
 
 
-BOXES = (
-    box(TaskStatus, "task.status"),
-    box(ServoStatus, "servo.status"),
-    box(ArmState, "arm.state"),
-)
+@pytest.fixture
+def segment(make_bus: MakeBus) -> Segment:
+    boxes = (TaskStatus, "task.status"), (ServoStatus, "servo.status"), (ArmState, "arm.state")
+    tasks = task("task"), task("servo", slot=3), task("arm", slot=4)
+    return make_bus(*(box(kind, name) for kind, name in boxes), *tasks)
 
 
 def write(segment: Segment, name: str, **fields: object) -> None:
@@ -51,10 +50,7 @@ def write(segment: Segment, name: str, **fields: object) -> None:
     writer.close()
 
 
-def test_the_last_states_of_levels_are_reported_with_their_reasons(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    segment = make_bus(*BOXES, *TASKS)
+def test_the_last_states_of_levels_are_reported_with_their_reasons(segment: Segment) -> None:
     assert format_levels(segment) == ""
     write(segment, "arm.state", tick=1)
     write(segment, "task.status", state=State.ERROR, reason="no path")
@@ -63,10 +59,7 @@ def test_the_last_states_of_levels_are_reported_with_their_reasons(
     assert format_levels(segment) == "task error (no path), servo executing"
 
 
-def test_only_a_level_that_gave_up_because_of_a_time_is_late(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    segment = make_bus(*BOXES, *TASKS)
+def test_only_a_level_that_gave_up_because_of_a_time_is_late(segment: Segment) -> None:
     assert not is_late(segment)
     write(segment, "servo.status", state=State.EXECUTING, error=Error.NONE)
     for state, error, late in (
@@ -78,10 +71,7 @@ def test_only_a_level_that_gave_up_because_of_a_time_is_late(
         assert is_late(segment) is late
 
 
-def test_the_arm_is_as_its_board_last_reported_it(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    segment = make_bus(*BOXES, *TASKS)
+def test_the_arm_is_as_its_board_last_reported_it(segment: Segment) -> None:
     still = read_arm(segment)
     assert (still.violations, still.touches, still.is_at_rest) == (0, 0, True)
     for speed, rests in ((0.5, True), (-0.5, True), (-2.0, False)):
@@ -91,21 +81,16 @@ def test_the_arm_is_as_its_board_last_reported_it(
         assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
 
 
-def test_strikes_come_from_the_fault_table_and_from_outside_kills(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    segment = make_bus(*BOXES, *TASKS)
+def test_strikes_come_from_the_fault_table_and_from_outside_kills(segment: Segment) -> None:
     table = FaultTable(segment)
     bias, mute = KINDS["sensor-bias"], KINDS["mute"]
     joint = tuple(1.0 if p.name == "joint" else 0.25 for p in bias.parameters)
     injected = Injection(bias.number, 1, tick=40, ticks=400, seed=7, parameters=joint)
-    begun, waits = (
-        table.add_fault(injected),
-        table.add_fault(Injection(mute.number, 0, mailbox=0, tick=90)),
-    )
+    begun = table.add_fault(injected)
+    waits = table.add_fault(Injection(mute.number, 0, mailbox=0, tick=90))
     begun.stage = Stage.ACTIVE
     begun.record_action(43)
-    first, second = list_strikes(segment, JOINTS)
+    first, second = list_strikes(segment, ("shoulder", "elbow"))
     assert (first.kind, first.board) == ("sensor-bias", "servo")
     assert (first.began, first.tick, first.count) == (40, 43, 1)
     assert (first.joint, first.mailboxes) == ("elbow", ("servo.status",))

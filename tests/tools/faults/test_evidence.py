@@ -7,11 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from rack.tools.faults.evidence import (
-    Aftermath,
-    count_skipped_ticks,
-    find_aftermath,
-)
+from rack.tools.faults.evidence import Aftermath, count_skipped_ticks, find_aftermath
 from tests.tools.fault_events import event, strike
 
 KILL = strike("kill", "lower", 100)

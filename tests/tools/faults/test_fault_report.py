@@ -14,23 +14,16 @@ from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.viewer.reading import read_component
-from tests.conftest import SMALL
+from tests.shared_runs import faulty_run
 
-HANG = '{ kind = "hang", board = "upper", tick = 80 }'
-NEVER = '{ kind = "hang", board = "lower", when = "upper.status.state == error", for = "20ms" }'
+pytestmark = pytest.mark.slow
 
 Report = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in lockstep in which a board was stopped, and another fault found no cause to begin."""
-    path = tmp_path_factory.mktemp("hang")
-    (path / "small.toml").write_text(SMALL)
-    name = f"name={path.parent.name}-hang"
-    config = load(path / "small.toml", [name, f"fault=[{HANG}, {NEVER}]"])
-    run_rack(config, 3.0, path / "run", Display())
-    return path / "run"
+    return faulty_run(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +31,6 @@ def report(folder: Path) -> Report:
     return write_report(folder)[0]
 
 
-@pytest.mark.slow
 def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(
     folder: Path, report: Report
 ) -> None:
@@ -56,7 +48,6 @@ def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(
     assert json.loads((folder / "report.json").read_text()) == report
 
 
-@pytest.mark.slow
 def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     lines = format_markdown(report).splitlines()
     head = lines.index("## Faults: 2")
@@ -74,7 +65,6 @@ def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     assert not {"Faults", "restarts"} & set(plain.replace(":", " ").split())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("lasts", [', for = "50ms"', ""])
 def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
     small: Path, tmp_path: Path, rack_name: str, lasts: str
@@ -89,24 +79,16 @@ def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
     assert row.strip("| ").endswith(str(bool(lasts)))
 
 
-@pytest.mark.slow
 def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder: Path) -> None:
-    lane = (
-        read_component(folder / "run.rrd", "/events/1-upper", "StateChange:state")
-        .values.ravel()
-        .tolist()
-    )
+    def shown(entity: str, component: str) -> list[str]:
+        return list(read_component(folder / "run.rrd", entity, component).values.ravel())
+
+    lane = shown("/events/1-upper", "StateChange:state")
     # The fault ends with its board's process; who hears of which first is open, and the reaction
     # stays in sight.
     assert [state for state in lane if state] == ["fault", "died", "reaction", "recovery"]
     assert "" not in lane[lane.index("died") :]
-    text = read_component(folder / "run.rrd", "/log/events", "TextLog:text").values.ravel().tolist()
-    levels = (
-        read_component(folder / "run.rrd", "/log/events", "TextLog:level").values.ravel().tolist()
-    )
+    text, levels = (shown("/log/events", f"TextLog:{part}") for part in ("text", "level"))
     level_of = {line.split(": ")[1]: level for line, level in zip(text, levels, strict=True)}
-    assert (level_of["fault"], level_of["detection"], level_of["recovery"]) == (
-        "WARN",
-        "ERROR",
-        "INFO",
-    )
+    found = [level_of[kind] for kind in ("fault", "detection", "recovery")]
+    assert found == ["WARN", "ERROR", "INFO"]

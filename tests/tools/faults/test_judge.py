@@ -9,14 +9,9 @@ import pytest
 
 from rack.backplane.fault_table import NEVER
 from rack.boards.events import Event
+from rack.tools.faults import judge
 from rack.tools.faults.ending import EXTERNAL, Strike
-from rack.tools.faults.judge import (
-    Circumstances,
-    FaultVerdict,
-    Judgement,
-    judge_faults,
-    report_faults,
-)
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge_faults
 from tests.tools.fault_events import LAYOUT, TICK_NS, box, event, flows, found, strike
 
 END = event(10_000, "end", "")
@@ -29,13 +24,16 @@ OVERRUN = strike("overrun", "lower", 100, 150)
 NAN = strike("command-nan", "lower", 100, 110)
 OFF = strike("actuator-off", "lower", 100, 150, joint="elbow")
 STUCK = strike("sensor-stuck", "lower", 100, 2000, count=1900)
-SEEN = found(107, "mute", "upper", "lower.status")
+MUTED = "lower.status"
+SEEN = found(107, "mute", "upper", MUTED)
 DIED = Event(100 * TICK_NS + 49_900_000, 101, "died", "lower", "died", "died")
 CLOSED = event(100, "reaction", "brakes_closed", "lower")
 LATCHED = event(900, "reaction", "latched", "lower")
 RESTART = event(100, "reaction", "restart", "lower")
 REJOINED = event(300, "recovery", "rejoined", "lower")
 SKIPS = [event(106, "miss", "clock_skipped", board, value=5.0) for board in ("upper", "lower")]
+ELBOW = found(103, "actuator", "lower", "elbow")
+OPENED = event(110, "recovery", "brakes_opened", "lower")
 INVALID, LIMIT = (
     found(100, code, "lower", "elbow") for code in ("command_invalid", "command_limit")
 )
@@ -63,14 +61,10 @@ FOUND: dict[str, tuple[Strike, list[Event], dict[str, Any]]] = {
     "not by another alarm": (MUTE, [replace(SEEN, code="stale")], MISSED),
     "not about another mailbox": (MUTE, [found(104, "mute", "lower", "upper.command")], MISSED),
     "not before it struck": (MUTE, [replace(SEEN, tick=99)], MISSED),
-    "not by its own begin": (
-        MUTE,
-        [event(104, "fault", "begins", "lower", "lower.status")],
-        MISSED,
-    ),
+    "not by its own begin": (MUTE, [event(104, "fault", "begins", "lower", MUTED)], MISSED),
     "not if it never acted": (
         replace(strike("drop", "lower", 100, 150), tick=-1, count=0),
-        [found(110, "gap", "upper", "lower.status")],
+        [found(110, "gap", "upper", MUTED)],
         {"seen": "not struck", "is_within": False},
     ),
     # The two tasks tell of the same five ticks.
@@ -87,61 +81,35 @@ FOUND: dict[str, tuple[Strike, list[Event], dict[str, Any]]] = {
     "at its joint": (replace(NAN, joint="elbow"), [INVALID], {"seen": "detected"}),
     "not at another joint": (replace(NAN, joint="wrist"), [INVALID], {"seen": "missed"}),
     "at no joint": (replace(NAN, joint="elbow"), [replace(INVALID, subject="")], {"delay": 0}),
-    "in its own cycle, not a cycle later": (
-        NAN,
-        [found(101, "command_invalid", "lower")],
-        {"is_within": False},
-    ),
-    "a small error of a sensor, which need not be found": (
-        strike("sensor-bias", "lower", 100, 110, size=1e-4),
-        [],
-        {"is_judged": False},
-    ),
-    "a great one, which must": (
-        strike("sensor-bias", "lower", 100, 110, size=1.0),
-        [],
-        {"is_judged": True},
-    ),
+    "in its own cycle, not later": (NAN, [replace(INVALID, tick=101)], {"is_within": False}),
+    # A small error of a sensor need not be found.
+    "small": (strike("sensor-bias", "lower", 100, 110, size=1e-4), [], {"is_judged": False}),
+    "great": (strike("sensor-bias", "lower", 100, 110, size=1.0), [], {"is_judged": True}),
     "no sooner than it shows": (
         replace(strike("actuator-saturated", "lower", 100, 150), hidden=15, count=30),
-        [found(127, "actuator", "lower", "elbow")],
+        [replace(ELBOW, tick=127)],
         {"struck": 100, "delay": 27, "bound": 15 + 12, "is_within": True},
     ),
     "over before it must be found": (replace(OFF, count=4), [], {"seen": "not struck"}),
     "not over before it must be found": (replace(OFF, count=5), [], {"seen": "missed"}),
-    "over, and found": (
-        replace(OFF, count=4),
-        [found(103, "actuator", "lower", "elbow")],
-        {"seen": "detected"},
-    ),
+    "over, and found": (replace(OFF, count=4), [ELBOW], {"seen": "detected"}),
 }
 
 
-@pytest.mark.parametrize(("struck", "events", "expected"), FOUND.values(), ids=FOUND)
-def test_a_fault_is_found(struck: Strike, events: list[Event], expected: dict[str, Any]) -> None:
-    fault = asdict(judged(struck, *events))
-    assert {name: fault[name] for name in expected} == expected
-
-
+BRAKED = event(104, "reaction", "brakes_closed", "lower", value=3.0)
 UNDONE = {"is_recovered": False, "recovery": None}
 FLOWING = 50 + 1 + 1 + 100
 """A message is due a tick after the end, and read a tick later; then a quarter of a second."""
 RECOVERED: dict[str, tuple[Strike, list[Event], dict[str, Any]]] = {
     "when the last reaction is undone": (
         KILL,
-        [
-            *(RESTART, replace(CLOSED, tick=103), REJOINED),
-            event(340, "recovery", "brakes_opened", "lower"),
-        ],
+        [RESTART, replace(CLOSED, tick=103), REJOINED, replace(OPENED, tick=340)],
         {"reactions": ("restart", "brakes_closed"), "is_recovered": True, "recovery": 240},
     ),
     "not when another board rejoins": (KILL, [RESTART, replace(REJOINED, board="upper")], UNDONE),
     "when brakes that closed for missed cycles open": (
         OVERRUN,
-        [
-            event(104, "reaction", "brakes_closed", "lower", value=3.0),
-            event(107, "recovery", "brakes_opened", "lower"),
-        ],
+        [BRAKED, replace(OPENED, tick=107)],
         {"reactions": ("brakes_closed",), "is_recovered": True, "recovery": 7},
     ),
     "not while the brakes are closed": (strike("sensor-nan", "lower", 100), [CLOSED], UNDONE),
@@ -150,21 +118,18 @@ RECOVERED: dict[str, tuple[Strike, list[Event], dict[str, Any]]] = {
         [replace(LATCHED, tick=110), flows(152)],
         {"reactions": (), "is_recovered": True},
     ),
-    "not with brakes for the missed cycles of another": (
-        strike("drop", "upper", 100, 110),
-        [event(104, "reaction", "brakes_closed", "lower", value=3.0)],
-        {"reactions": ()},
-    ),
+    # They are for the missed cycles of another.
+    "not with those brakes": (strike("drop", "upper", 100, 110), [BRAKED], {"reactions": ()}),
     "whatever comes long after it": (NAN, [replace(CLOSED, tick=5000)], {"reactions": ()}),
     # A quarter of a second after the end of the fault.
     "within its bound": (
         NAN,
-        [INVALID, CLOSED, event(110 + 100, "recovery", "brakes_opened", "lower")],
+        [INVALID, CLOSED, replace(OPENED, tick=110 + 100)],
         {"is_recovered": True, "recovery_bound": 110},
     ),
     "not beyond its bound": (
         NAN,
-        [INVALID, CLOSED, event(110 + 101, "recovery", "brakes_opened", "lower")],
+        [INVALID, CLOSED, replace(OPENED, tick=110 + 101)],
         {"is_recovered": False, "recovery_bound": 110},
     ),
     "not while messages do not flow": (MUTE, [SEEN], UNDONE | {"recovery_bound": FLOWING}),
@@ -184,10 +149,12 @@ RECOVERED: dict[str, tuple[Strike, list[Event], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize(("struck", "events", "expected"), RECOVERED.values(), ids=RECOVERED)
-def test_a_fault_is_recovered_from(
-    struck: Strike, events: list[Event], expected: dict[str, Any]
-) -> None:
+CASES = {f"found {when}": case for when, case in FOUND.items()}
+CASES |= {f"recovered from {when}": case for when, case in RECOVERED.items()}
+
+
+@pytest.mark.parametrize(("struck", "events", "expected"), CASES.values(), ids=CASES)
+def test_a_fault_is_judged(struck: Strike, events: list[Event], expected: dict[str, Any]) -> None:
     fault = asdict(judged(struck, *events))
     assert {name: fault[name] for name in expected} == expected
 
@@ -195,8 +162,9 @@ def test_a_fault_is_recovered_from(
 HIT = replace(
     found(300, "collision", "lower", "arm"), text="unintended contact: 'arm' touches 'post'"
 )
-HELD_UP = [CLOSED, event(110, "recovery", "brakes_opened", "lower"), HIT, replace(CLOSED, tick=300)]
-STALE = found(110, "stale", "upper", "lower.status")
+HELD_UP = [CLOSED, OPENED, HIT, replace(CLOSED, tick=300)]
+LATE = event(105, "miss", "late", "clock", "lower")
+STALE = found(110, "stale", "upper", MUTED)
 # Its bound, a cycle and two seconds and a quarter for a restart, the last message's way, a quarter
 # of a second.
 LAST = 100 + 2 + 1 + 900 + (1 + 8) + 100
@@ -207,19 +175,14 @@ EXPLAINED = [
     (KILL, [replace(STALE, tick=LAST)], REAL_TIME, []),
     (KILL, [replace(STALE, tick=LAST + 1)], REAL_TIME, [0]),
     (KILL, [found(110, "stale", "lower", "upper.command")], REAL_TIME, [0]),
-    (KILL, [found(110, "damaged", "upper", "lower.status")], REAL_TIME, [0]),
+    (KILL, [found(110, "damaged", "upper", MUTED)], REAL_TIME, [0]),
     (KILL, [found(110, "sensor_nan", "lower", "elbow")], REAL_TIME, [0]),
     (KILL, [found(110, "hang", "clock", "upper")], REAL_TIME, [0]),
     (KILL, [event(110, "died", "died", "upper")], REAL_TIME, [0]),
-    (
-        MUTE,
-        [replace(SEEN, tick=5000), event(4000, "miss", "late", "clock", "lower")],
-        REAL_TIME,
-        [0],
-    ),
+    (MUTE, [replace(SEEN, tick=5000), replace(LATE, tick=4000)], REAL_TIME, [0]),
     # What a task finds has the tick of its release, which may be before the fault.
-    (FORGED, [found(97, "masquerade", "lower.planner", "lower.status")], REAL_TIME, []),
-    (FORGED, [found(94, "masquerade", "lower.planner", "lower.status")], REAL_TIME, [0]),
+    (FORGED, [found(97, "masquerade", "lower.planner", MUTED)], REAL_TIME, []),
+    (FORGED, [found(94, "masquerade", "lower.planner", MUTED)], REAL_TIME, [0]),
     # A sensor at fault may show at any joint, a motor at its own.
     (
         strike("sensor-bias", "lower", 100, 110, joint="elbow", size=1.0),
@@ -251,17 +214,9 @@ def test_a_fault_explains_only_consequences_of_its_kind_in_its_window(
         (NAN, [], ("brakes_closed",)),
         (MUTE, [], ()),
         # Brakes that are engaged when it strikes need not be engaged for it.
-        (NAN, [LIMIT, event(60, "reaction", "brakes_closed")], ()),
-        (
-            NAN,
-            [event(60, "reaction", "brakes_closed"), event(99, "recovery", "brakes_opened")],
-            ("brakes_closed",),
-        ),
-        (
-            NAN,
-            [event(60, "reaction", "brakes_closed"), event(101, "recovery", "brakes_opened")],
-            (),
-        ),
+        (NAN, [LIMIT, replace(CLOSED, tick=60)], ()),
+        (NAN, [replace(CLOSED, tick=60), replace(OPENED, tick=99)], ("brakes_closed",)),
+        (NAN, [replace(CLOSED, tick=60), replace(OPENED, tick=101)], ()),
     ],
 )
 def test_a_required_reaction_that_does_not_follow_is_lacking(
@@ -293,14 +248,14 @@ def test_the_brakes_for_an_obstacle_in_the_way_are_no_reaction_to_a_motor() -> N
 
 def test_one_alarm_is_the_detection_of_one_of_two_equal_faults() -> None:
     both = [strike("corrupt", "lower", 100, 200), strike("corrupt", "lower", 101, 200, place=1)]
-    alarms = [found(tick, "damaged", "upper", "lower.status") for tick in (103, 111)]
+    alarms = [found(tick, "damaged", "upper", MUTED) for tick in (103, 111)]
     assert [fault.seen for fault in verdict(both, alarms[0]).faults] == ["detected", "missed"]
     assert [fault.seen for fault in verdict(both, *alarms).faults] == ["detected", "detected"]
 
 
 @pytest.mark.parametrize("kind", ["kill", EXTERNAL])
 def test_a_death_that_the_rack_finds_late_is_late_whatever_its_neighbours_find(kind: str) -> None:
-    killed, stale = strike(kind, "lower", 100), found(104, "stale", "upper", "lower.status")
+    killed, stale = strike(kind, "lower", 100), found(104, "stale", "upper", MUTED)
     fault = judged(killed, stale, DIED)
     assert (fault.found_by, fault.delay_ms, fault.bound_ms) == ("the Rack", 49.9, 50.0)
     assert fault.is_within
@@ -330,21 +285,17 @@ def test_reactions_after_the_next_fault_belong_to_that_fault() -> None:
 
 
 def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
-    ends = [
-        judge_faults([NAN], [INVALID, CLOSED, event(end, "end", "")], REAL_TIME)
-        for end in (209, 210)
-    ]
-    assert [found.faults[0].is_recovered for found in ends] == [True, False]
+    ends = [[INVALID, CLOSED, replace(END, tick=end)] for end in (209, 210)]
+    faults = [judge_faults([NAN], events, REAL_TIME).faults[0] for events in ends]
+    assert [fault.is_recovered for fault in faults] == [True, False]
 
 
 def test_nothing_recovers_from_a_fault_of_messages_without_an_end() -> None:
-    silent = replace(MUTE, ends=NEVER)
-    fault = judge_faults([silent], [flows(99), SEEN, event(200, "end", "")], REAL_TIME).faults[0]
+    end, silent = replace(END, tick=200), replace(MUTE, ends=NEVER)
+    (fault,) = judge_faults([silent], [flows(99), SEEN, end], REAL_TIME).faults
     assert (fault.seen, fault.struck, fault.is_recovered) == ("detected", 100, False)
     # One that was to end says nothing yet.
-    (fault,) = judge_faults(
-        [replace(MUTE, ends=900)], [SEEN, event(200, "end", "")], REAL_TIME
-    ).faults
+    (fault,) = judge_faults([replace(MUTE, ends=900)], [SEEN, end], REAL_TIME).faults
     assert fault.seen == "not struck"
 
 
@@ -389,7 +340,9 @@ def test_faults_are_listed_as_they_struck_and_those_that_never_did_last() -> Non
     late, first = strike("hang", "upper", 100, 200), strike("hang", "lower", 0, 50)
     never = strike("mute", "lower", NEVER, NEVER)
     struck = [asdict(one) for one in (late, never, first)]
-    found = report_faults([{"kind": "outcome", "outcome": {}, "faults": struck}], LAYOUT)["faults"]
+    found = judge.report_faults([{"kind": "outcome", "outcome": {}, "faults": struck}], LAYOUT)[
+        "faults"
+    ]
     assert [(one["kind"], one["board"], one["struck"]) for one in found] == [
         ("hang", "lower", 0),
         ("hang", "upper", 100),

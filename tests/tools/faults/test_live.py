@@ -29,24 +29,21 @@ class Running:
         self.table = FaultTable(segment)
         self.live = LiveRack(segment)
 
-    def begin(self, number: int, until: int = TICK + 9) -> None:
-        """Begin a fault, as the clock does."""
-        entry = self.table.entries[number]
+    def begin(self, until: int = TICK + 9) -> None:
+        """Begin the first fault, as the clock does."""
+        entry = self.table.entries[0]
         entry.tick = TICK + 1
         entry.until = until
         entry.stage = Stage.ACTIVE
 
-    def end(self, number: int, acted: int = 3) -> None:
-        """End it."""
-        entry = self.table.entries[number]
-        entry.count = acted
-        entry.stage = Stage.OVER
-
-    def serve(self) -> None:
-        """Begin the first fault as soon as it waits, and end it."""
-        wait_until(lambda: self.table.entries[0].stage == Stage.WAITING)
-        self.begin(0)
-        self.end(0)
+    def serve(self, acted: int = 0) -> None:
+        """Begin the first fault as soon as it waits, and end it if it is to act."""
+        entry = self.table.entries[0]
+        wait_until(lambda: entry.stage == Stage.WAITING)
+        self.begin()
+        if acted:
+            entry.count = acted
+            entry.stage = Stage.OVER
 
 
 @pytest.fixture
@@ -59,41 +56,28 @@ def rack(small: Path, rack_name: str) -> Iterator[Running]:
 
 
 def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> None:
-    def serve() -> None:
-        wait_until(lambda: rack.table.entries[0].stage == Stage.WAITING)
-        rack.begin(0)
-
-    with in_thread(serve):
-        found = rack.live.inject_fault(
-            {"board": "lower", "kind": "drop", "probability": "0.5"}, False
-        )
+    drop = {"board": "lower", "kind": "drop", "probability": "0.5"}
+    with in_thread(rack.serve):
+        found = rack.live.inject_fault(drop, False)
     assert (found["fault"], found["stage"], found["waits_for"]) == (0, "active", "")
     assert found["message"].endswith(f": from tick {TICK + 1} to tick {TICK + 8}")
-    rack.begin(0, NEVER)
+    rack.begin(NEVER)
     assert rack.live._describe_state(rack.table.entries[0]).endswith("to the end of the run")
 
 
 @pytest.mark.parametrize(("acted", "text"), [(1, "acted once"), (3, "acted 3 times")])
 def test_a_fault_that_is_over_says_when_it_acted(rack: Running, acted: int, text: str) -> None:
-    def serve() -> None:
-        wait_until(lambda: rack.table.entries[0].stage == Stage.WAITING)
-        rack.begin(0)
-        rack.end(0, acted)
-
-    with in_thread(serve):
-        found = rack.live.inject_fault(
-            {"board": "lower", "kind": "mute", "cycles": "4"}, True, 20.0
-        )
+    mute = {"board": "lower", "kind": "mute", "cycles": "4"}
+    with in_thread(lambda: rack.serve(acted)):
+        found = rack.live.inject_fault(mute, True, 20.0)
     assert found["stage"] == "over"
     assert found["message"].endswith(f": ticks {TICK + 1} to {TICK + 8}, {text}")
 
 
 def test_a_fault_with_a_future_tick_is_armed_and_can_be_withdrawn(rack: Running) -> None:
     found = rack.live.inject_fault({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
-    assert (found["stage"], found["waits_for"]) == (
-        "waiting",
-        f"tick {TICK + 1}; the rack is at tick {TICK}",
-    )
+    assert found["stage"] == "waiting"
+    assert found["waits_for"] == f"tick {TICK + 1}; the rack is at tick {TICK}"
     hint = f"to withdraw it: rack inject {rack.segment.rack} --withdraw 0"
     assert found["message"].endswith(f"armed, waits for {found['waits_for']}; {hint}")
     with pytest.raises(Failure, match="fault 1 is not waiting; waiting: 0"):
@@ -118,7 +102,7 @@ def test_a_fault_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
 
     def begin() -> None:
         wait_until(lambda: rack.table.entries[0].tick == NEVER)
-        rack.begin(0)
+        rack.begin()
         rack.segment.words[System.TICK] = TICK + 2
 
     with (

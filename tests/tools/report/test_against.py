@@ -74,6 +74,7 @@ below = "adding"
 executor = "{module}:Passing"
 """
 Run = Callable[..., Recording]
+Runs = tuple[Run, Recording, Recording]
 
 
 def run_in(folder: Path, rack_name: str) -> Run:
@@ -98,7 +99,7 @@ def ran(rack_name: str, tmp_path: Path) -> Run:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Recording]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     """A function that runs the same rack again, a run, and a run with another parameter."""
     run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
     return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
@@ -116,14 +117,13 @@ def _losing(run: Recording) -> Path:
     folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
     events = folder / "events.jsonl"
     lines = [parse_checked_line(line) for line in events.read_text().splitlines()]
-    ends = [
-        line | {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else line for line in lines
-    ]
-    events.write_text("".join(map(format_checked_line, ends)))
+    for line in lines:
+        line |= {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else {}
+    events.write_text("".join(map(format_checked_line, lines)))
     return folder
 
 
-def test_equal_runs_have_no_chain(runs: tuple[Run, Recording, Recording], tmp_path: Path) -> None:
+def test_equal_runs_have_no_chain(runs: Runs, tmp_path: Path) -> None:
     _, one, _ = runs
     again = Recording(Path(shutil.copytree(one.folder, tmp_path / "again")))
     found = explain_difference(one, again)
@@ -131,9 +131,7 @@ def test_equal_runs_have_no_chain(runs: tuple[Run, Recording, Recording], tmp_pa
     assert found["explained"]
 
 
-def test_a_parameter_is_named_with_the_attributes_that_it_changed(
-    runs: tuple[Run, Recording, Recording],
-) -> None:
+def test_a_parameter_is_named_with_the_attributes_that_it_changed(runs: Runs) -> None:
     _, one, two = runs
     found = explain_difference(two, one)
     (cycle,) = found["chain"]
@@ -148,7 +146,7 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(
 
 
 def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
-    runs: tuple[Run, Recording, Recording], tmp_path: Path
+    runs: Runs, tmp_path: Path
 ) -> None:
     _, one, _ = runs
     config = load_branch_config(one, ["board.wave.params.factor=2"], None)
@@ -173,7 +171,7 @@ def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     ],
 )
 def test_a_fault_is_the_cause_and_nothing_is_repeated(
-    runs: tuple[Run, Recording, Recording], kind: str, more: str, field: str, kinds: set[str]
+    runs: Runs, kind: str, more: str, field: str, kinds: set[str]
 ) -> None:
     again, one, _ = runs
     fault = f"[[fault]]\nkind = '{kind}'\nboard = 'wave'\ntick = 130\n{more}\n"
@@ -209,10 +207,8 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     assert repetition["attributes"] == ()
     # The other level only forwards its input.
     chain = explain_difference(one, two, of="passing.sum", repeats=False)["chain"]
-    assert [(one["mailbox"], one["unequal"]) for one in chain] == [
-        ("passing.sum", "adding.sum"),
-        ("adding.sum", ""),
-    ]
+    places = [(one["mailbox"], one["unequal"]) for one in chain]
+    assert places == [("passing.sum", "adding.sum"), ("adding.sum", "")]
 
 
 def test_an_operators_command_is_the_cause(ran: Run) -> None:
@@ -228,7 +224,7 @@ def test_an_operators_command_is_the_cause(ran: Run) -> None:
 
 
 def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
-    runs: tuple[Run, Recording, Recording], ran: Run, tmp_path: Path
+    runs: Runs, ran: Run, tmp_path: Path
 ) -> None:
     _, one, two = runs
     done = rack("report", two.folder, "--against", one.folder)

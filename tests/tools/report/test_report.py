@@ -30,9 +30,6 @@ from rack.tools.timing.measured_response import measure_system_response
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.shared_runs import slow_run
 
-PARTS = ("min", "p50", "p99", "p99_9", "max")
-
-TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
 MS = 1_000_000
 
 
@@ -56,10 +53,10 @@ def cycle(tick: int, late: float, read: float, process: float, write: float) -> 
 
 
 def test_times_of_a_task_follow_equation_3_5() -> None:
-    cycles = np.array(
-        [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
-    )
-    times = compute_task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
+    rows = [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)]
+    task = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
+    cycles = np.array(rows, RECORD)
+    times = compute_task_times(task, cycles, 10 * MS, False, stretches=np.zeros(3))
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
     assert times["communication_ms"]["max"] == 2.0
@@ -117,9 +114,8 @@ def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(fol
 @pytest.mark.slow
 def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: Path) -> None:
     recording = SilentRecording(folder)
-    recording.end_counts["faults"] = [
-        {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
-    ]
+    mute = {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
+    recording.end_counts["faults"] = [mute]
     response = measure_system_response(recording)
     assert response is not None
     (beyond,) = response["command"]["beyond"]
@@ -127,20 +123,14 @@ def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: P
     assert (beyond["tick"], beyond["ms"]) == (19 * 40, (45 + 10 * 40) * 2.5)
     assert beyond["delayed_by"] == ["fault: mute of upper"]
     lines = format_markdown(write_report(folder)[0] | {"system_response": response}).splitlines()
-    (row,) = (
-        line for line in lines if line.startswith("| command, upper to lower ") and "760" in line
-    )
-    assert [cell.strip() for cell in row.split("|")[2:5]] == [
-        "760",
-        "1112.5",
-        "fault: mute of upper",
-    ]
+    found = [line for line in lines if line.startswith("| command, upper to lower ")]
+    (row,) = (line for line in found if "760" in line)
+    cells = [cell.strip() for cell in row.split("|")[2:5]]
+    assert cells == ["760", "1112.5", "fault: mute of upper"]
 
 
 @pytest.mark.slow
-def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
-    folder: Path,
-) -> None:
+def test_a_response_beyond_its_bound_fails_unless_something_explains_it(folder: Path) -> None:
     sound = build_report(Recording(folder))
     assert (sound["worked"], sound["failures"], sound["unjudged"]) == (True, [], [])
     report = build_report(SilentRecording(folder))
@@ -182,12 +172,8 @@ def test_lockstep_reports_no_time_relative_to_the_clock(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(folder: Path) -> None:
-    late = {"task": "lower", "tick": 5, "what": "late", "count": 1} | {
-        "started_ms": 0.1,
-        "took_ms": 3.0,
-        "why": "own execution",
-        "why_ms": 2.9,
-    }
+    late = {"task": "lower", "tick": 5, "what": "late", "count": 1}
+    late |= {"started_ms": 0.1, "took_ms": 3.0, "why": "own execution", "why_ms": 2.9}
     skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
     skipped |= {"why": "not recorded", "why_ms": None}
     report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
@@ -208,10 +194,8 @@ def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(fol
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> None:
     report = {**write_report(folder)[0], "mode": "realtime"}
-    task = {
-        **report["tasks"]["lower"],
-        **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567)),
-    }
+    long = dict.fromkeys(("min", "p50", "p99", "p99_9", "max"), 1234.567)
+    task = {**report["tasks"]["lower"], "lateness_ms": long, "residual_ms": long}
     report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
     terminal = Console(width=width, record=True, file=io.StringIO(), force_terminal=True)
     print_blocks(format_report(report), terminal)

@@ -20,7 +20,6 @@ from tests.tools.command_line import rack
 
 @pytest.fixture
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with its report."""
     run = small_run(tmp_path_factory)
     write_report(run)
     return run

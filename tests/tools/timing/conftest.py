@@ -14,14 +14,8 @@ BUDGETED = f"""
 format = 2
 name = "budgeted"
 python_path = ["{Path(__file__).resolve().parents[2]}"]
-
-[clock]
-period_ms = 2.5
-core = 0
-priority = 90
-
-[timing]
-context_switch_ms = 0.1
+clock = {{ period_ms = 2.5, core = 0, priority = 90 }}
+timing.context_switch_ms = 0.1
 
 [board.upper]
 slot = 2
@@ -30,11 +24,7 @@ rate_hz = 50
 priority = 70
 below = "lower"
 executor = "two_levels:Upper"
-
-[board.upper.budget]
-read_ms = 1.0
-process_ms = 2.0
-write_ms = 1.0
+budget = {{ read_ms = 1.0, process_ms = 2.0, write_ms = 1.0 }}
 
 [board.lower]
 slot = 3
@@ -46,14 +36,12 @@ executor = "two_levels:Lower"
 planner = "two_levels:LowerPlanner"
 coupling = "tight"
 within_cycles = 4
-
-[board.lower.budget]
-read_ms = 0.5
-process_ms = 3.0
-write_ms = 0.5
-exchange_ms = 0.25
-plan_ms = 8.0
-update_ms = 0.5
+budget.read_ms = 0.5
+budget.process_ms = 3.0
+budget.write_ms = 0.5
+budget.exchange_ms = 0.25
+budget.plan_ms = 8.0
+budget.update_ms = 0.5
 """
 """Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles.
 
@@ -64,18 +52,8 @@ Judge = Callable[..., JudgedConfig]
 
 
 @pytest.fixture
-def budgeted(tmp_path: Path) -> Path:
-    """Write the rack to a file."""
+def judge(tmp_path: Path) -> Judge:
+    """Return a function that judges the rack with settings."""
     path = tmp_path / "budgeted.toml"
     path.write_text(BUDGETED)
-    return path
-
-
-@pytest.fixture
-def judge(budgeted: Path) -> Judge:
-    """Return a function that judges the rack with settings."""
-
-    def judged(*settings: str) -> JudgedConfig:
-        return JudgedConfig.judge(load(budgeted, settings))
-
-    return judged
+    return lambda *settings: JudgedConfig.judge(load(path, settings))

@@ -7,62 +7,42 @@ from collections.abc import Sequence
 import pytest
 
 from rack.boards.config import load, load_text
-from rack.tools.timing.judged_config import Change, JudgedConfig
+from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import find_changes, find_repair
 from rack.tools.timing.summary import format_fixes
 from tests.tools.timing.conftest import Judge
 
 
-def list_settings(judged: JudgedConfig, board: str = "lower") -> list[dict[str, object]]:
-    return [change.settings for change in find_changes(judged, board)]
-
-
-def find_change(judged: JudgedConfig, key: str) -> Change:
-    """Return the first change for the lower board that sets `key`."""
-    return next(change for change in find_changes(judged, "lower") if key in change.settings)
+def list_settings(judged: JudgedConfig) -> list[dict[str, object]]:
+    return [change.settings for change in find_changes(judged, "lower")]
 
 
 ELSEWHERE = {"coupling": "loose", "planner_slot": 4, "planner_core": 2}
 LATE = "within_cycles=1"
 """8.5 of planning, 5.55 left in a cycle."""
+OLDER, LONGER = {"within_cycles": 2}, {"every": 8, "rate_hz": None}
+FULL = [
+    f"board.other{slot}={{ slot = {slot}, executor = 'two_levels:Upper', below = 'lower', every ="
+    " 8, core = 3 }"
+    for slot in range(4, 22)
+]
+"""Boards in all other slots."""
 
 
 @pytest.mark.parametrize(
     ("lower", "others", "cores", "expected"),
     [
-        pytest.param(
-            # 5, 6 and 7 ticks are no grid with 8: waiting for it would take more than n R_max. Core
-            # 0 has 4.2 of every 20 ms to do, more than 10 - 8.7.
-            (LATE,),
-            (),
-            2,
-            [{"within_cycles": 2}, {"every": 8, "rate_hz": None}, ELSEWHERE],
-            id="a core that the machine lacks comes last",
-        ),
-        pytest.param(
-            (LATE,),
-            (),
-            3,
-            [ELSEWHERE, {"within_cycles": 2}, {"every": 8, "rate_hz": None}],
-            id="one that it has comes before older plans",
-        ),
-        pytest.param(
-            (LATE, "budget.plan_within_ms=15"), (), 2, [ELSEWHERE], id="plans must not grow old"
-        ),
-        pytest.param(
-            ("budget.process_ms=9",), (), 2, [{"every": 8, "rate_hz": None}], id="too long a cycle"
-        ),
-        pytest.param(
-            (LATE,),
-            [
-                f"board.other{slot}={{ slot = {slot}, executor = 'two_levels:Upper', below ="
-                " 'lower', every = 8, core = 3 }"
-                for slot in range(4, 22)
-            ],
-            2,
-            [{"within_cycles": 2}, {"every": 8, "rate_hz": None}],
-            id="no free slot for a planner",
-        ),
+        # 5, 6 and 7 ticks are no grid with 8: waiting for it would take more than n R_max. Core 0
+        # has 4.2 of every 20 ms to do, more than 10 - 8.7. A core that is not there comes last.
+        ((LATE,), (), 2, [OLDER, LONGER, ELSEWHERE]),
+        # One that it has comes before older plans.
+        ((LATE,), (), 3, [ELSEWHERE, OLDER, LONGER]),
+        # Plans must not grow old.
+        ((LATE, "budget.plan_within_ms=15"), (), 2, [ELSEWHERE]),
+        # Too long a cycle.
+        (("budget.process_ms=9",), (), 2, [LONGER]),
+        # No free slot for a planner.
+        ((LATE,), FULL, 2, [OLDER, LONGER]),
     ],
 )
 def test_changes_are_the_smallest_of_each_kind_the_cheapest_first(
@@ -83,12 +63,9 @@ def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
     # Both on core 1, the slow level above the fast one: its 7.2 and 4.45 are more than the fast
     # one's 10.
     settings = ("core=1", "priority=85", "budget.process_ms=5")
-    judged = judge(
-        *(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1"
-    )
-    assert ("response time", "lower") in {
-        (verdict.equation, verdict.subject) for verdict in judged.failures
-    }
+    upper = (f"board.upper.{setting}" for setting in settings)
+    judged = judge(*upper, "board.lower.budget.plan_ms=0.1")
+    assert ("response time", "lower") in {(v.equation, v.subject) for v in judged.failures}
     first = find_changes(judged, "lower")[0]
     assert (first.settings, first.text) == ({"priority": 86}, "board 'lower': priority 80 -> 86")
     assert first.after.failures == ()
@@ -97,9 +74,8 @@ def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1")
     for change in find_changes(judged, "lower"):
-        assert not JudgedConfig.judge(
-            load_text(change.after.config.to_toml_text()), judged.budgets
-        ).failures
+        config = load_text(change.after.config.to_toml_text())
+        assert not JudgedConfig.judge(config, judged.budgets).failures
 
 
 def test_the_next_smaller_change_does_not_help(judge: Judge) -> None:
@@ -111,7 +87,8 @@ def test_the_next_smaller_change_does_not_help(judge: Judge) -> None:
 
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
-    loosened = find_change(judged, "coupling")
+    found = find_changes(judged, "lower")
+    loosened = next(change for change in found if "coupling" in change.settings)
     assert loosened.after.layout.find_mailbox("lower.plan").protocol == "time-slice"
     assert loosened.to_document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
@@ -173,8 +150,6 @@ def test_two_steps_loosen_the_planner_and_lengthen_the_cycle(judge: Judge) -> No
     # A plan must not grow older than 40 ms, and takes 35 of them.
     budget = ("process_ms=13", "plan_ms=35", "plan_within_ms=40")
     repaired = find_repair(judge(*(f"board.lower.budget.{time}" for time in budget)))
-    assert [[*changes[0].settings] for changes in repaired.steps] == [
-        [*ELSEWHERE],
-        ["within_cycles", "every", "rate_hz"],
-    ]
+    keys = [[*changes[0].settings] for changes in repaired.steps]
+    assert keys == [[*ELSEWHERE], ["within_cycles", "every", "rate_hz"]]
     assert not repaired.remaining_failures

@@ -26,7 +26,6 @@ MORE = "--verbose shows every task, mailbox and equation"
 
 
 def check_lines(*words: object, status: int = 0) -> list[str]:
-    """Return the lines that a check prints."""
     done = rack("check", *words)
     assert (done.returncode, done.stderr) == (status, "")
     return done.stdout.splitlines()
@@ -37,9 +36,8 @@ def test_the_verdict_of_a_rack_that_fits_is_followed_by_a_bar_per_core() -> None
     found = check_lines("nasrem")
     starts = ("fits: all ", "rack nasrem: ", "core 0 ", "core 1 ", "tightest: ", "response: ")
     assert [line[: len(start)] for line, start in zip(found, starts, strict=False)] == [*starts]
-    assert found[3] == (
-        "core 1  [###############.]  98.6%  servo 51%, task.planner 43%, servo.planner 5%"
-    )
+    bar = "core 1  [###############.]  98.6%"
+    assert found[3] == f"{bar}  servo 51%, task.planner 43%, servo.planner 5%"
     assert found[5] == "response: a command down 1282.5 ms, a status up 2280 ms"
     assert found[-1] == MORE
     assert len(found) <= 10
@@ -124,9 +122,8 @@ def test_the_command_in_the_verdict_measures_what_was_missing(
     monkeypatch.chdir(tmp_path)
     settings = ("--set", "clock.mode=lockstep", "--set", "timing.clock_ms=0.01")
     printed = "\n".join(check_lines(small, *settings)).replace("\\\n", "")
-    first, second = (
-        shlex.split(line) for line in printed.splitlines() if line.startswith("  rack ")
-    )
+    lines = (line for line in printed.splitlines() if line.startswith("  rack "))
+    first, second = map(shlex.split, lines)
     assert rack(*first[1:]).returncode == 0
     assert "no budget" not in "\n".join(check_lines(*second[2:]))
 
@@ -134,10 +131,8 @@ def test_the_command_in_the_verdict_measures_what_was_missing(
 def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -> None:
     overload = "board.lower.budget={ process_ms = 2.0, plan_ms = 1e6 }"
     found = check_lines(small, "--set", overload, *ALONE, "--verbose", status=1)
-    assert any(
-        line.startswith("tightest: planner 'lower.planner' never finishes: core 1 is over")
-        for line in found
-    )
+    never = "tightest: planner 'lower.planner' never finishes: core 1 is over"
+    assert any(line.startswith(never) for line in found)
     assert not [line for line in found if re.search(r"\binf\b|inf%", line)]
 
 

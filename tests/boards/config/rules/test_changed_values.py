@@ -22,13 +22,7 @@ from tests.snapshots import ROOT, Snapshots, digest
 
 pytestmark = pytest.mark.thorough
 SNAPSHOTS = Snapshots(__file__)
-RACKS = (
-    "nasrem.toml",
-    "cyclic.toml",
-    "brown/one-machine.toml",
-    "cell/puma.toml",
-    "fig4.toml",
-)
+RACKS = ("nasrem.toml", "cyclic.toml", "brown/one-machine.toml", "cell/puma.toml", "fig4.toml")
 SKIPPED = {"name", "python_path", "format", "joints", "task", "mesh", "model", "seed"}
 """Keys whose values are no numbers of the rack's own, or one like many others."""
 FIRST = 2
@@ -49,7 +43,6 @@ def places(tables: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str 
 
 
 def others(value: Any) -> list[Any]:
-    """Return other values in place of one."""
     if isinstance(value, bool):
         return [not value]
     if isinstance(value, int):

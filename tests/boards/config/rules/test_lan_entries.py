@@ -10,175 +10,117 @@ import pytest
 
 from rack.boards.config import load, resolve
 from rack.boards.config.loader import load_text
-from rack.boards.config.toml import apply_settings, parse_tables, to_toml
+from rack.boards.config.toml import parse_tables, to_toml
 from rack.boards.errors import ConfigError
+from tests.boards.config.mistakes import find_mistake, read_config
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text("one", "tcp/127.0.0.1:7447", [], "two", peers=["three"])
 TESTS = Path(__file__).parents[3]
-MISTAKES = {
-    "a rate that does not divide": (
-        ["adapter.lan.import.other.rate_hz=15"],
-        (
-            "adapter.lan.import.other.rate_hz = 15.0: exchange: 15 Hz does not divide the 50 Hz of"
-            " the adapter; nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)"
-        ),
+IMPORT = "type = 'lan_levels:PulseStatus', max_age_ms = 500"
+MISTAKES = [
+    (
+        "adapter.lan.import.other.rate_hz=15",
+        "adapter.lan.import.other.rate_hz = 15.0: exchange: 15 Hz does not divide the 50 Hz of the"
+        " adapter; nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)",
     ),
-    "the adapter's rate": (
-        [
-            "adapter.lan.rate_hz=33",
-            "adapter.lan.import.other.rate_hz=33",
-            "adapter.lan.export.pulse.rate_hz=33",
-        ],
+    (
+        "adapter.lan.rate_hz=33",
+        "adapter.lan.import.other.rate_hz=33",
+        "adapter.lan.export.pulse.rate_hz=33",
         "adapter.lan.rate_hz: level 'lan': 33 Hz does not divide the 400 Hz clock",
     ),
-    "a servo loop": (
-        ["board.pulse.rate_hz=400"],
-        (
-            'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, too fast for a'
-            " loop over a network, which can run at up to 50 Hz; export the slower mailboxes of the"
-            " task and elemental-move levels"
-        ),
+    # A servo loop.
+    (
+        "board.pulse.rate_hz=400",
+        'export.pulse.from = "pulse.status": written at 400 Hz, too fast for a loop over a network,'
+        " which can run at up to 50 Hz",
     ),
-    "no such mailbox": (
-        ["adapter.lan.export.pulse.from=pulse.pulse"],
-        (
-            'adapter.lan.export.pulse.from = "pulse.pulse": no such mailbox; mailboxes:'
-            " pulse.status, echo.status"
-        ),
+    (
+        "adapter.lan.export.pulse.from=pulse.pulse",
+        'export.pulse.from = "pulse.pulse": no such mailbox; mailboxes: pulse.status, echo.status',
     ),
-    "a mailbox of the adapter": (
-        ["adapter.lan.export.again={ from = 'lan.other' }"],
-        (
-            'adapter.lan.export.again.from = "lan.other": the adapter itself writes it; only'
-            " mailboxes of levels can be exported"
-        ),
+    (
+        "adapter.lan.export.again={ from = 'lan.other' }",
+        'adapter.lan.export.again.from = "lan.other": the adapter itself writes it',
     ),
-    "a queue": (
-        [
-            f"python_path=['{TESTS / 'boards'}', '{TESTS / 'boards/lan'}']",
-            (
-                "board.sender={ slot = 9, rate_hz = 50, executor = 'queue_levels:Asking', params ="
-                " { burst = 1 } }"
-            ),
-            "adapter.lan.export.again={ from = 'sender.requests' }",
-        ],
-        (
-            'adapter.lan.export.again.from = "sender.requests": a queue gives each message once, to'
-            " its reader in this rack"
-        ),
+    (
+        f"python_path=['{TESTS / 'boards'}', '{TESTS / 'boards/lan'}']",
+        "board.sender={ slot = 9, every = 8, executor = 'queue_levels:Asking', params.burst = 1 }",
+        "adapter.lan.export.again={ from = 'sender.requests' }",
+        'adapter.lan.export.again.from = "sender.requests": a queue gives each message once',
     ),
-    "a rack itself": (
-        [
-            "adapter.lan.import.own={ from = 'one/pulse.status', type = 'lan_levels:PulseStatus',"
-            " max_age_ms = 500 }"
-        ],
-        (
-            'adapter.lan.import.own.from = "one/pulse.status": this mailbox belongs to this rack,'
-            " whose levels can read it"
-        ),
+    (
+        f"adapter.lan.import.own={{ from = 'one/pulse.status', {IMPORT} }}",
+        'adapter.lan.import.own.from = "one/pulse.status": this mailbox belongs to this rack',
     ),
-    "a peer itself": (
-        ["adapter.lan.peers=['one']"],
-        'adapter.lan.peers = "one": this is the name of this rack itself',
+    ("adapter.lan.peers=['one']", 'lan.peers = "one": this is the name of this rack itself'),
+    (
+        "adapter.lan.peers=['a-b', 'a_b']",
+        "adapter.lan.peers = ['a-b', 'a_b']: these names differ only in '-' and '_', so they would"
+        " share mailbox lan.peer_a_b",
     ),
-    "peers alike": (
-        ["adapter.lan.peers=['a-b', 'a_b']"],
-        (
-            "adapter.lan.peers = ['a-b', 'a_b']: these names differ only in '-' and '_', so they"
-            " would share mailbox lan.peer_a_b"
-        ),
+    (
+        "adapter.lan.import.other.type=lan_levels:Plus",
+        "import.other.type = \"lan_levels:Plus\": module 'lan_levels' has no message class 'Plus'",
     ),
-    "an unknown type": (
-        ["adapter.lan.import.other.type=lan_levels:Plus"],
-        (
-            "adapter.lan.import.other.type = \"lan_levels:Plus\": module 'lan_levels' has no"
-            " message class 'Plus'"
-        ),
-    ),
-    "a type with sizes of an arm": (
-        [
-            "adapter.lan.import.more={ from = 'two/servo.command', type ="
-            " 'rack.levels.messages:JointCommand', max_age_ms = 500 }"
-        ],
+    # A type with sizes of an arm.
+    (
+        "adapter.lan.import.more={ from = 'two/servo.command', type ="
+        " 'rack.levels.messages:JointCommand', max_age_ms = 500 }",
         'adapter.lan.import.more.type = "rack.levels.messages:JointCommand": ',
     ),
-    "another type than the level reads": (
-        ["adapter.lan.import.other.type=lan_levels:Heard"],
+    (
+        "adapter.lan.import.other.type=lan_levels:Heard",
         'board.echo.reads.other = "lan.other": carries heard 1; the port needs pulse 1',
     ),
-    "too short an age": (
-        ["adapter.lan.import.other.rate_hz=10"],
-        (
-            "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges a message gets as"
-            " old as their interval and one cycle of the adapter; must be at least 120 ms"
-        ),
+    (
+        "adapter.lan.import.other.rate_hz=10",
+        "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges a message gets as old"
+        " as their interval and one cycle of the adapter; must be at least 120 ms",
     ),
-    "an import twice": (
-        [
-            "adapter.lan.import.again={ from = 'two/pulse.status', type = 'lan_levels:PulseStatus',"
-            " rate_hz = 50, max_age_ms = 500 }"
-        ],
-        (
-            'adapter.lan.import = "two/pulse.status": listed 2 times: other, again; any number of'
-            " levels may read one port"
-        ),
+    (
+        f"adapter.lan.import.again={{ from = 'two/pulse.status', rate_hz = 50, {IMPORT} }}",
+        'adapter.lan.import = "two/pulse.status": listed 2 times: other, again',
     ),
-    "a port of the adapter's own": (
-        [
-            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus',"
-            " max_age_ms = 500 }"
-        ],
-        "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
+    (
+        f"adapter.lan.import.status={{ from = 'two/a.b', {IMPORT} }}",
+        "adapter.lan.import.status: the adapter writes its status under this name",
     ),
-    "a board of its name": (
-        ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
-        (
-            "board.lan: [adapter.lan] adds a board of this name; rename this board, or remove one"
-            " of them"
-        ),
+    (
+        "board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }",
+        "board.lan: [adapter.lan] adds a board of this name",
     ),
-    "a board that is the adapter": (
-        ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
-        (
-            'board.net.executor = "rack.boards.lan.adapter:LanAdapter": this class needs the table'
-            " [adapter.lan], which adds its board"
-        ),
+    (
+        "board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }",
+        'board.net.executor = "rack.boards.lan.adapter:LanAdapter": this class needs the table',
     ),
-    "a priority below a neighbour's": (
-        ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],
-        (
-            "adapter.lan.priority = 40: must be above the other boards on core 0, pulse 40;"
-            " otherwise they can delay"
-        ),
+    (
+        "clock.mode=realtime",
+        "adapter.lan.priority=40",
+        "board.pulse.priority=40",
+        "adapter.lan.priority = 40: must be above the other boards on core 0, pulse 40",
     ),
-    "determinism in real time": (
-        ["clock.mode=realtime", "protocol.strict=true"],
-        (
-            "adapter.lan: messages of other racks make a run depend on timing, which"
-            ' protocol.strict = true refuses; clock.mode must be "lockstep"'
-        ),
+    (
+        "clock.mode=realtime",
+        "protocol.strict=true",
+        "adapter.lan: messages of other racks make a run depend on timing",
     ),
-}
+]
+"""Settings, and what the mistake says."""
 
 
 def resolved(*settings: str) -> None:
     """Check the config with these settings, in lockstep if they do not say otherwise."""
-    resolve(
-        load_text(
-            to_toml(apply_settings(parse_tables(TEXT), ["clock.mode=lockstep", *settings], []))
-        )
-    )
+    resolve(read_config(TEXT, ["clock.mode=lockstep", *settings]))
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_one_line(name: str) -> None:
-    settings, line = MISTAKES[name]
-    with pytest.raises(ConfigError) as error:
-        resolved(*settings)
-    (mistake,) = error.value.mistakes
-    assert line in str(mistake)
-    assert "board.lan." not in str(mistake)
+@pytest.mark.parametrize("case", MISTAKES, ids=lambda case: case[-1])
+def test_a_mistake_is_one_line(case: tuple[str, ...]) -> None:
+    *settings, line = case
+    found = find_mistake(TEXT, "clock.mode=lockstep", *settings)
+    assert line in found
+    assert "board.lan." not in found
 
 
 def test_valid_tables_have_no_mistakes() -> None:
@@ -215,13 +157,8 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(__import__("sys").modules, "zenoh", None)
     for module in ("link", "entries", "adapter"):
         monkeypatch.delitem(__import__("sys").modules, f"rack.boards.lan.{module}", raising=False)
-    with pytest.raises(ConfigError) as error:
-        resolved()
-    assert (
-        str(error.value)
-        == "adapter.lan: an exchange with other racks needs eclipse-zenoh: pip install"
-        " 'nasrem-rack[lan]'"
-    )
+    why = "an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
+    assert find_mistake(TEXT) == f"adapter.lan: {why}"
 
 
 def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:

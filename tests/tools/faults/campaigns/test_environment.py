@@ -70,11 +70,8 @@ def test_a_load_is_a_busy_process_a_core_and_one_that_writes(
         wait_until(lambda: len(list_living_descendants() - before) >= cores + 1 + has_stress)
         busy = list_living_descendants() - before
     wait_until(lambda: not any(runs(pid) for pid in busy))
-    assert told == (
-        f"stress-ng --cpu {cores} --io 1"
-        if has_stress
-        else f"{cores} busy processes and one that writes"
-    )
+    own = f"{cores} busy processes and one that writes"
+    assert told == (f"stress-ng --cpu {cores} --io 1" if has_stress else own)
 
 
 def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(

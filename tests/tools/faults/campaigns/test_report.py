@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from rack.tools.faults.campaigns.campaign import Campaign, Order
+from rack.tools.faults.campaigns.campaign import Campaign
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.report import MAX_SHOWN, CampaignReport
 from rack.tools.faults.campaigns.results import FaultlessTime, Results, TrialResult
@@ -53,18 +54,9 @@ TRIALS = [
 ]
 
 
-class Made:
-    """The part of a campaign that its report reads."""
-
-    layout = LAYOUT
-    kinds = ("mute", "sensor-bias")
-    order = cast(Order, None)
-
-
 def report_of(results: Results) -> CampaignReport:
-    """Return the report of these results."""
-    campaign = Made()
-    campaign.order = cast(Order, Ordered())
+    order = SimpleNamespace(name="small", seed=9, modes=(True, False))
+    campaign = SimpleNamespace(layout=LAYOUT, kinds=("mute", "sensor-bias"), order=order)
     return CampaignReport(cast(Campaign, campaign), results, 61.26)
 
 
@@ -74,55 +66,32 @@ def made() -> CampaignReport:
     trip = found(7, "gap", "upper", "lower.status")
     calm = run(0, ticks=20 * SECOND, unexplained=(trip,), misses={"plan_late": 2}, stray_misses=9)
     swept = run(4, faults=(judgement("sensor-bias", delay=None, size=0.01, struck=40),))
-    results = Results(
-        RUN,
-        list(TRIALS),
-        [swept],
-        [FaultlessTime("a load", 20.0, (calm,))],
-        ["overrun: did not strike"],
-    )
+    faultless = FaultlessTime("a load", 20.0, (calm,))
+    results = Results(RUN, list(TRIALS), [swept], [faultless], ["overrun: did not strike"])
     return report_of(results)
 
 
 @pytest.fixture
 def report(made: CampaignReport) -> dict[str, Any]:
-    """Return its document."""
     return made.to_document()
-
-
-class Ordered:
-    """What was ordered."""
-
-    name = "small"
-    seed = 9
-    modes = (True, False)
 
 
 def test_the_figures_summarise_the_right_runs(report: dict[str, Any]) -> None:
     summary = report["summary"]
-    assert {key: summary[key] for key in ("trials", "tasks_done", "safely_stopped", "neither")} == {
-        "trials": 3,
-        "tasks_done": 1,
-        "safely_stopped": 1,
-        "neither": 1,
-    }
+    ends = ("trials", "tasks_done", "safely_stopped", "neither")
+    assert [summary[key] for key in ends] == [3, 1, 1, 1]
     assert (summary["injected"], summary["detected"], summary["not_struck"]) == (3, 2, 1)
     assert (summary["limits_violated"], summary["touches"], summary["left_behind"]) == (3, 1, 1)
     # The nominal run, three trials, one of the sweep, and 20 s without faults.
     assert summary["simulated_s"] == 70.0
-    assert (summary["unexplained"], summary["unexplained_per_hour"]["an_hour"]) == (
-        1,
-        pytest.approx(3600 / 70, abs=1e-3),
-    )
+    assert summary["unexplained"] == 1
+    assert summary["unexplained_per_hour"]["an_hour"] == pytest.approx(3600 / 70, abs=1e-3)
     # In lockstep no miss is stray, and those without faults are counted apart.
     assert summary["stray_misses"] == 2
     assert (summary["false_trips"], summary["faultless_s"]) == (1, 20.0)
     assert summary["false_trips_per_hour"]["an_hour"] == 180.0
-    assert (report["wall_s"], report["clock_ms"], report["modes"]) == (
-        61.3,
-        2.5,
-        ["lockstep", "realtime"],
-    )
+    assert (report["wall_s"], report["clock_ms"]) == (61.3, 2.5)
+    assert report["modes"] == ["lockstep", "realtime"]
     assert report["nominal"] == {"ticks": 4000, "seconds": 10.0, "digest": "abcd"}
     assert report["machine"]["notes"] == ["no real time"]
     assert report["shortfalls"] == ["trial 2: late", "overrun: did not strike"]

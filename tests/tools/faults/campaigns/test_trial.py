@@ -14,25 +14,25 @@ from rack.boards.config import load
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.campaigns.trial import Killer, run_trial
 from tests.backplane.bus import task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 PERIOD_NS = 2_500_000
 
 
-def bus(make: MakeBus, pid: int, lockstep: bool = True) -> Segment:
+def bus(make: MakeBus, pid: int) -> Segment:
     """Return the memory of a rack whose board `level` is this process, and whose clock stands at
     tick 0."""
     segment = make(task("level"), task("other", slot=3))
     words, block = segment.words, segment.get_block("level")
-    words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, lockstep, 0
+    words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, True, 0
     words[System.EPOCH_NS] = time.monotonic_ns()
     block[Block.PID], block[Block.STATE] = pid, TaskState.RUNNING
     return segment
 
 
-def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) -> None:  # noqa: F811
+def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) -> None:
     with forked(lambda: time.sleep(BOUND_S)) as pid:
         segment = bus(make_bus, pid)
         killer = Killer(segment, [Kill(board="level", tick=5, phase=0.0)])
@@ -52,8 +52,7 @@ def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) ->
 
 @pytest.mark.parametrize("word", ["STATE", "LOST"])
 def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
-    make_bus: MakeBus,  # noqa: F811
-    word: str,
+    make_bus: MakeBus, word: str
 ) -> None:
     with forked(lambda: time.sleep(BOUND_S)) as pid:
         segment = bus(make_bus, pid)

@@ -17,24 +17,20 @@ from rack.tools.timing.charts.patterns import (
 )
 
 
-def task(
-    name: str, text: str, every: int, cycles: int = 1, core: int = 1, priority: int = 80
-) -> TimedTask:
+def task(name: str, text: str, every: int, cycles: int = 1, priority: int = 80) -> TimedTask:
     parts = tuple(Part(Unit(part[0]), int(part[1:])) for part in text.split())
     role = "planner" if name.endswith("planner") else "executor"
-    return TimedTask(name, name.partition(".")[0], role, core, priority, every, parts, cycles)
+    return TimedTask(name, name.partition(".")[0], role, 1, priority, every, parts, cycles)
 
 
 EXECUTOR = task("a", "R100 X200 W100", 800)
 PLANNER = task("a.planner", "P600 U100", 800, 2, priority=0)
 
 
-def count(
-    tasks: list[TimedTask], lane: str, end: int, detail: PatternDetail | None = None
-) -> Patterns:
+def count(tasks: list[TimedTask], lane: str, end: int) -> Patterns:
     chart = simulate_schedule(tasks, 2 * end)
     found = next(found for found in build_lanes(tasks) if found.name == lane)
-    return count_patterns(chart, found, (0, end), detail or PatternDetail())
+    return count_patterns(chart, found, (0, end), PatternDetail())
 
 
 def test_a_plan_has_one_pattern_over_all_its_cycles() -> None:
@@ -55,9 +51,8 @@ def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
     # Remove the jobs and spans of the last three of five plans.
     kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
     spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
-    found = count_patterns(
-        Chart(0, 8000, spans, kept), build_lanes([EXECUTOR, PLANNER])[0], (0, 6400), PatternDetail()
-    )
+    lane, cut = build_lanes([EXECUTOR, PLANNER])[0], Chart(0, 8000, spans, kept)
+    found = count_patterns(cut, lane, (0, 6400), PatternDetail())
     assert dict(found.plans) == {"R X W P | R X W P U -": 2}
     assert dict(found.cycles) == {"R X W -": 4}
 
@@ -73,10 +68,8 @@ LANE = Lane(1, "a", "a", None, 80, 1000, 1000, 0)
 
 def find_pattern(*stretches: tuple[str, int, int], detail: PatternDetail) -> str:
     spans = tuple(Span("a", 1, Unit(unit), start, end, 0) for unit, start, end in stretches)
-    found = count_patterns(
-        Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail
-    )
-    (pattern,) = found.cycles
+    chart = Chart(0, 2000, spans, (Job("a", 0, 1000, 900),))
+    (pattern,) = count_patterns(chart, LANE, (0, 1000), detail).cycles
     return pattern
 
 
@@ -90,6 +83,5 @@ def test_measured_patterns_leave_out_remnants_and_short_gaps() -> None:
 @pytest.mark.parametrize("start", [0, 1, 799, 800])
 def test_patterns_begin_on_the_grid_and_in_the_stretch(start: int) -> None:
     chart, lane = simulate_schedule([EXECUTOR], 8000), build_lanes([EXECUTOR])[0]
-    assert count_patterns(chart, lane, (start, 4000), PatternDetail()).cycles.total() == (
-        5 if start == 0 else 4
-    )
+    found = count_patterns(chart, lane, (start, 4000), PatternDetail())
+    assert found.cycles.total() == (5 if start == 0 else 4)

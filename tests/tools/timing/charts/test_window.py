@@ -11,11 +11,9 @@ from rack.tools.timing.charts.gantt import WindowOptions, choose_task
 MS = 1_000_000
 
 
-def task(name: str, every_ms: float, cycles: int = 1, core: int = 0, board: str = "") -> TimedTask:
+def task(name: str, every_ms: float, cycles: int = 1) -> TimedTask:
     role = "planner" if name.endswith("planner") else "executor"
-    return TimedTask(
-        name, board or name.partition(".")[0], role, core, 0, round(every_ms * MS), (), cycles
-    )
+    return TimedTask(name, name.partition(".")[0], role, 0, 0, round(every_ms * MS), (), cycles)
 
 
 NASREM = [
@@ -52,7 +50,6 @@ def test_a_window_begins_and_ends_as_requested(
 
 
 def build_options(from_ms: float | None, to_ms: float | None) -> WindowOptions:
-    """Return the options for these times."""
     return WindowOptions(*(None if ms is None else round(ms * MS) for ms in (from_ms, to_ms)))
 
 

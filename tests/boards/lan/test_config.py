@@ -1,9 +1,0 @@
-"""The keys of `[adapter.lan]`, with their ranges and defaults, are those that users read."""
-
-from __future__ import annotations
-
-from tests import reference
-
-
-def test_the_page_of_all_keys_has_those_of_the_network() -> None:
-    assert reference.is_on_page("adapter.lan")
