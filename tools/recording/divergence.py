@@ -120,7 +120,11 @@ def find_tick_range(recording: Recording) -> tuple[int, int]:
         begins.append(int(rows["tick"][0]) - skipped * recording.layout.find_task(name).every)
         ends.append(int(rows["tick"][-1]) + 1)
     end: int = recording.end_counts.get("outcome", {}).get("ticks", 0)
-    return min(begins, default=0), end or max(ends, default=0)
+    end = end or max(ends, default=0)
+    if (origin := Origin.read_from(recording)) is not None:
+        # Cycles that the original run began may end in the continuation.
+        return origin.tick, end
+    return min(begins, default=0), end
 
 
 def find_common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:

@@ -159,6 +159,22 @@ def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
+def test_a_branch_may_begin_while_a_cycle_is_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, run = tmp_path / "late.toml", tmp_path / "run"
+    fault = '[[fault]]\nkind = "overrun"\nboard = "watch"\ntick = 100\nfor = 0.25\nby = 2.0\n'
+    path.write_text(REMEMBERING + fault)
+    run_rack(load(path, [f"name=test-late-{tmp_path.name[-20:]}"]), 1.0, run, Display())
+    # The cycle that was released at tick 104 ends after tick 110.
+    branch = tmp_path / "branch"
+    found = Asked(run, monkeypatch)("goto 0.275", f"branch --out {branch}")[-1]
+    expected = Recording(run).end_counts["outcome"]["digest"]
+    assert found["outcome"]["digest"] == expected
+    assert found["first_difference"] is None
+    assert min(Recording(branch).cycles["watch"]["tick"]) == 104
+
+
 def test_a_mistake_is_reported_in_one_line_with_the_usage(asked: Asked) -> None:
     lines = {
         "goot 3": "goot: no such command; nearest: goto",
