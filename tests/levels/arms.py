@@ -7,7 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rack.levels.robot.cell import Cell, build_cell
+import numpy as np
+
+from rack.backplane.message import Message
+from rack.levels.arm.plant import Plant
+from rack.levels.level import LevelContext
+from rack.levels.messages import ArmState
+from rack.levels.planning.moves import Situation
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 
 CLOCK_NS = 2_500_000
@@ -52,6 +59,24 @@ def config(name: str) -> tuple[RobotConfig, SceneConfig]:
 
 def cell(name: str) -> Cell:
     return build_cell(*config(name), CLOCK_NS)
+
+
+def context(board: str, arm: tuple[RobotConfig, SceneConfig], **fields: Any) -> LevelContext:
+    """Return the context of a level, with these fields: else cycles of 1 ms, and no task."""
+    given = {"every": 1, "within_cycles": 1, "clock_ns": 1_000_000, "seed": 1, "task": {}} | fields
+    return LevelContext(board=board, robot=arm[0], scene=arm[1], **({"sizes": {}} | given))
+
+
+def save_state(arm: Plant) -> Message:
+    state = ArmState.zeros(compute_sizes(arm.cell))
+    arm.save(state)
+    return state
+
+
+def find_situation(made: Cell) -> Situation:
+    """Return where the objects of a cell are at the start."""
+    poses = made.build_start_data().qpos[made.object_qpos[:, None] + np.arange(7)]
+    return Situation(poses[:, :3].copy(), poses[:, 3:].copy())
 
 
 def pendulum(
@@ -107,11 +132,9 @@ GRIPPER = {"actuator": "grip", "joint": "crank_left", "open": 0.6, "closed": 0.0
 
 
 def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
-    """Write the PUMA in its cell with a gripper of closed loops to `folder`: a parallelogram a
-    finger, two gears.
+    """Write the PUMA with a gripper of closed loops to `folder`: a parallelogram a finger, two gears.
 
-    The cranks turn outwards by the opening, in rad; each tip stays parallel because a rod closes
-    its loop.
+    The cranks turn outwards by the opening, in rad; rods keep the tips parallel.
     """
     sides = [
         FOUR_BAR_FINGER.format(side=side, y=y, back=back, x=x)
@@ -120,14 +143,9 @@ def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
     text = before + FOUR_BAR.format(left=sides[0], right=sides[1]) + rest.split("</body>", 3)[3]
     text = text.replace('<exclude body1="finger_left" body2="finger_right"/>', "")
-    text = (
-        text[: text.index("<equality>") + 10]
-        + FOUR_BAR_EQUALITY
-        + text[text.index("</equality>") :]
-    )
-    text = text.replace(
-        '<motor name="grip" joint="finger_left"', '<motor name="grip" joint="crank_left"'
-    )
+    head, equality = text.index("<equality>") + 10, text.index("</equality>")
+    text = text[:head] + FOUR_BAR_EQUALITY + text[equality:]
+    text = text.replace('name="grip" joint="finger_left"', 'name="grip" joint="crank_left"')
     (folder / "puma560.xml").write_text(text)
     cell_file = folder / "puma560_cell.xml"
     cell_file.write_text((ROBOTS / "puma560_cell.xml").read_text())

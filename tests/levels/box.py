@@ -10,24 +10,21 @@ import numpy as np
 from rack.backplane.message import Message
 
 SILENT_CYCLES = 4
-"""Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the
-one it waits."""
-Disturbance = Callable[[int, bytes], "Sequence[tuple[int, bytes | None]]"]
-"""A writer's fault: of a message visible at a tick, the messages that become visible, and when;
-None: a damaged one."""
+"""Age of a message, in its writer's cycles, at which the writer is silent: 3, and one to wait."""
+Shown = Sequence[tuple[int, bytes | None]]
+Disturbance = Callable[[int, bytes], Shown]
+"""A writer's fault: messages shown instead of one, and when. None stands for a damaged one."""
 
 
 class Box:
     """A mailbox under time-slice: messages wait until they are visible.
 
-    `every` is the cycle of a writer that writes in every one of them; None: planners and tests do
-    not. `lost`: the writer is known to be dead or to hang.
+    `every`: cycle of the writer. None for planners and tests, which do not write in each cycle.
+    `lost`: the writer is known to be dead or to hang.
     """
 
-    def __init__(
-        self, kind: type[Message], sizes_: Mapping[str, int], every: int | None = None
-    ) -> None:
-        self.kind, self.dtype = kind, kind.message_type.build_dtype(sizes_)
+    def __init__(self, kind: type[Message], sizes: Mapping[str, int], every: int | None = None):
+        self.kind, self.dtype = kind, kind.message_type.build_dtype(sizes)
         self.lost = False
         self.disturbance: Disturbance | None = None
         self._every = every
@@ -40,11 +37,10 @@ class Box:
     def publish(self, message: Message, visible_at: int) -> None:
         """Make `message` visible from tick `visible_at` on, unless a fault interferes."""
         data = bytes(message.raw)
-        for one in (
-            ((visible_at, data),)
-            if self.disturbance is None
-            else self.disturbance(visible_at, data)
-        ):
+        shown: Shown = ((visible_at, data),)
+        if self.disturbance is not None:
+            shown = self.disturbance(visible_at, data)
+        for one in shown:
             insort(self._waiting, one, key=lambda waiting: waiting[0])
 
     def withdraw(self, tick: int) -> None:
@@ -52,8 +48,7 @@ class Box:
         self._waiting = [one for one in self._waiting if one[0] <= tick]
 
     def at(self, tick: int) -> tuple[int, bytes | None]:
-        """Return serial and bytes of the newest message visible at `tick`, None if damaged; serial
-        0: none yet."""
+        """Return serial and bytes of the newest visible message: 0 if none, None if damaged."""
         while self._waiting and self._waiting[0][0] <= tick:
             since, self._now = self._waiting.pop(0)
             self._serial += 1
@@ -73,16 +68,12 @@ class Box:
         return tick - (self._good_since - self._every) >= SILENT_CYCLES * self._every
 
 
-Shown = Sequence[tuple[int, bytes | None]]
-
-
 def mute(visible_at: int, data: bytes) -> Shown:
     return ()
 
 
 def lose_some(probability: float, seed: int) -> Disturbance:
-    """Damage messages with that probability; to a reader, a dropped one is the same: a serial
-    without a message."""
+    """Damage messages with that probability; to a reader, dropped ones are the same."""
     chance = np.random.default_rng(seed)
     return lambda visible_at, data: ((visible_at, None if chance.random() < probability else data),)
 

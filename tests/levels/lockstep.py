@@ -30,6 +30,7 @@ from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
 
 CLOCK_NS = 2_500_000
+Boxes = Mapping[str, Box]
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,7 @@ class Task:
     """An executor or a planner with its ports."""
 
     def __init__(
-        self,
-        level: Executor | Planner,
-        spec: BoardSpec,
-        boxes: Mapping[str, Box],
-        outputs: Mapping[str, Box],
+        self, level: Executor | Planner, spec: BoardSpec, boxes: Boxes, outputs: Boxes
     ) -> None:
         self.level, self.spec, self.due = level, spec, 0
         # A port that reads many has an input for each board, by (port, board).
@@ -63,11 +60,9 @@ class Task:
         self._many = [port for port, input_ in ports.items() if input_.many]
         self._tables = {port: level.find_input_table(port) for port in ports}
         for port, input_ in ports.items():
-            names = sources(input_, spec)
-            self._inputs |= {
-                (port, name.partition(".")[0]) if input_.many else port: boxes[name]
-                for name in names
-            }
+            for name in sources(input_, spec):
+                key = (port, name.partition(".")[0]) if input_.many else port
+                self._inputs[key] = boxes[name]
         self._values = {
             port: ports[port if isinstance(port, str) else port[0]].message(box.dtype)
             for port, box in self._inputs.items()
@@ -136,8 +131,7 @@ class Task:
 
 
 class Lockstep:
-    """A rack in one process. `boxes` are its mailboxes by name, `tick` the tick that is due
-    next."""
+    """A rack in one process. `boxes`: its mailboxes by name; `tick`: the tick that is due next."""
 
     def __init__(
         self,
@@ -150,8 +144,7 @@ class Lockstep:
         clock_ns: int = CLOCK_NS,
         name: str = "",
     ) -> None:
-        """Start `boards`. `outside` are mailboxes that the test itself writes, with `write`; `name`
-        is the rack's."""
+        """Start `boards` of rack `name`. The test writes the mailboxes `outside`, with `write`."""
         self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
@@ -160,9 +153,8 @@ class Lockstep:
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
             for port, output in outputs_of(board).items():
-                self.boxes[f"{board.name}.{port}"] = Box(
-                    output.message, self.sizes, output.cycles * board.every
-                )
+                every = output.cycles * board.every
+                self.boxes[f"{board.name}.{port}"] = Box(output.message, self.sizes, every)
             if board.planner is not None:
                 plan = board.planner.outputs["plan"].message
                 self.boxes[f"{board.name}.plan"] = Box(plan, self.sizes)
@@ -197,15 +189,13 @@ class Lockstep:
         return started
 
     def restart(self, name: str) -> None:
-        """Replace a task ("primitive", "primitive.planner") by a fresh one, as after the death of
-        its board."""
+        """Replace a task ("primitive", "primitive.planner") as after the death of its board."""
         self.tasks[name].level.close()
         self.tasks[name] = self._start(self.tasks[name].spec)[name]
         self.tasks[name].rejoin(self.tick)
 
     def lose(self, name: str, ticks: int, finished: bool = True) -> None:
-        """Kill a task now and restart it `ticks` later; without `finished`, its present plan is
-        never made."""
+        """Kill a task and restart it `ticks` later; without `finished`, its plan is never made."""
         self.tasks[name].lose(self.tick, finished)
         self.after(ticks, lambda: self.restart(name))
 
@@ -246,8 +236,7 @@ class Lockstep:
         self.tick += 1
 
     def run(self, seconds: float, until: Callable[[Lockstep], bool] = lambda rack: False) -> bool:
-        """Run for simulated `seconds`, or until `until`, asked every 10 ticks, says so; return what
-        it said last."""
+        """Run for `seconds` of simulated time, or until `until`, asked every 10 ticks, is true."""
         end = self.tick + round(seconds * 1e9 / self._clock_ns)
         while self.tick < end:
             self.step()
@@ -266,11 +255,9 @@ def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
 
 def made_ports(board: BoardSpec, level: Executor | Planner) -> ConfiguredPorts:
     """Return the ports that the parameters of a board make; a planner has none."""
-    return (
-        board.executor.build_ports(board.params, {})
-        if isinstance(level, Executor)
-        else ConfiguredPorts()
-    )
+    if not isinstance(level, Executor):
+        return ConfiguredPorts()
+    return board.executor.build_ports(board.params, {})
 
 
 def outputs_of(board: BoardSpec) -> dict[str, WrittenPort[Any, Any]]:
@@ -292,8 +279,7 @@ class Operator:
     def say(
         self, level: str, what: Operation, joints: Sequence[float] = (), goal: Goal = Goal.NONE
     ) -> int:
-        """Give a command now; return its serial. `joints`, rad, are its goal where there are
-        any."""
+        """Give a command now, with `joints`, rad, as its goal if any; return its serial."""
         message = self._message(level, what, Goal.JOINTS if len(joints) else goal)
         message.count = len(joints)
         message.joints[: len(joints)] = joints

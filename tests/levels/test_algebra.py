@@ -19,15 +19,13 @@ POWERS = "exp exp2 expm1 log log2 log10 log1p cbrt atan2 arctan2 logaddexp"
 ELSEWHERE = {*PRODUCTS.split(), *POWERS.split()} | {
     name for stem in STEMS for name in (stem, f"a{stem}", f"arc{stem}")
 }
-"""Functions of numpy whose results depend on the processor: BLAS, vector code of its own, ties
-sorted in any order."""
+"""Functions of numpy whose results depend on the processor: BLAS, vector code, ties in sorts."""
 
 
 @pytest.mark.parametrize("joints", [1, 6, 7])
 def test_results_are_those_of_linear_algebra(joints: int) -> None:
-    square, tall, x, y = (
-        RNG.normal(size=shape) for shape in ((joints, joints), (6, joints), joints, 6)
-    )
+    shapes = (joints, joints), (6, joints), joints, 6
+    square, tall, x, y = (RNG.normal(size=shape) for shape in shapes)
     inertia = square.T @ square + np.eye(joints)
     assert algebra.mat_vec(tall, x) == pytest.approx(tall @ x)
     assert algebra.transposed_mat_vec(tall, y) == pytest.approx(tall.T @ y)
@@ -38,10 +36,8 @@ def test_results_are_those_of_linear_algebra(joints: int) -> None:
     assert np.array_equal(inertia, before[0])
     assert np.array_equal(x, before[1])
     assert algebra.norm(x) == pytest.approx(np.linalg.norm(x))
-    assert np.array_equal(
-        algebra.apply_elementwise(math.tanh, tall),
-        [[math.tanh(value) for value in row] for row in tall],
-    )
+    curved = [[math.tanh(value) for value in row] for row in tall]
+    assert np.array_equal(algebra.apply_elementwise(math.tanh, tall), curved)
 
 
 @pytest.mark.slow
@@ -69,13 +65,10 @@ def test_levels_multiply_no_arrays_with_an_operator() -> None:
 
 
 def depends_on_processor(call: ast.Call) -> bool:
-    """Say whether this is a call of numpy's BLAS or of its vector code; a norm over an axis is
-    neither."""
+    """Return True for calls of numpy's BLAS or vector code; a norm over an axis is neither."""
     match call.func:
         case ast.Attribute(attr="argsort"):  # of equal values, each vector unit has its own order
-            return not any(
-                k.arg == "kind" and ast.unparse(k.value) == "'stable'" for k in call.keywords
-            )
+            return "kind='stable'" not in map(ast.unparse, call.keywords)
         case ast.Attribute(value=ast.Name(id="np"), attr=name):
             return name in ELSEWHERE
         case ast.Attribute(value=ast.Attribute(value=ast.Name(id="np"), attr="linalg"), attr=name):

@@ -1,5 +1,4 @@
-"""Compiled code that is kept: what it is compiled from, damaged, not writable, and who hears that a
-function is compiled."""
+"""Compiled code that is kept: what it is compiled from, damaged, not writable, and reported."""
 
 from __future__ import annotations
 
@@ -16,6 +15,7 @@ from rack.levels.compiled import compiled
 from tests.processes import exit_status, fork
 
 SCALE = 3.0
+Captured = pytest.CaptureFixture[str]
 
 
 def twice(value: float) -> float:
@@ -27,7 +27,7 @@ def scaled(value: float) -> float:
 
 
 @pytest.fixture(autouse=True)
-def compiled_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Names of the functions compiled, in a cache of this test's own."""
     names: list[str] = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -50,14 +50,12 @@ def list_files(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_code_is_compiled_once_per_function_and_types(
-    compiled_names: list[str], tmp_path: Path
-) -> None:
+def test_code_is_compiled_once_per_types(names: list[str], tmp_path: Path) -> None:
     assert [call_fresh(), call_fresh()] == [3.0, 3.0]
-    assert compiled_names == ["tests.levels.test_compiled.twice"]
+    assert names == ["tests.levels.test_compiled.twice"]
     assert call_fresh(value=np.int64(2)) == 4.0
     assert call_fresh(scaled) == 4.5
-    assert len(compiled_names) == len(list_files(tmp_path)) == 3
+    assert len(names) == len(list_files(tmp_path)) == 3
 
 
 SOURCE = string.Template('''
@@ -88,20 +86,18 @@ def build_outer(**changes: str) -> compiled[[float], float]:
 
 
 @pytest.mark.slow
-def test_code_is_recompiled_only_if_its_source_or_constants_change(
-    compiled_names: list[str], tmp_path: Path
-) -> None:
+def test_code_is_recompiled_if_its_source_changes(names: list[str], tmp_path: Path) -> None:
     assert build_outer().load_machine_code()(1.0) == 4.0
-    assert compiled_names == ["theirs.outer", "theirs.inner"]
+    assert names == ["theirs.outer", "theirs.inner"]
     before = list_files(tmp_path)
     for same in ({"docstring": "Sum."}, {"comment": "Twice.\n\n"}):
         assert build_outer(**same).load_machine_code()(1.0) == 4.0
-    assert (len(compiled_names), list_files(tmp_path)) == (2, before)
+    assert (len(names), list_files(tmp_path)) == (2, before)
     assert build_outer(inner="value + 2.0").load_machine_code()(1.0) == 6.0
-    assert compiled_names[2:] == ["theirs.outer", "theirs.inner"]
+    assert names[2:] == ["theirs.outer", "theirs.inner"]
     assert build_outer(inner="value + 2.0", factor="3.0").load_machine_code()(1.0) == 9.0
     # The called one is the same.
-    assert compiled_names[4:] == ["theirs.outer"]
+    assert names[4:] == ["theirs.outer"]
     # And none of an earlier state stays.
     assert len(list_files(tmp_path)) == 2
 
@@ -125,10 +121,7 @@ def flip_bit(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", [truncate_file, flip_bit])
 def test_damaged_code_is_reported_and_compiled_again(
-    damage: Callable[[Path], None],
-    compiled_names: list[str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    damage: Callable[[Path], None], names: list[str], tmp_path: Path, capsys: Captured
 ) -> None:
     call_fresh()
     (file,) = list_files(tmp_path)
@@ -136,16 +129,14 @@ def test_damaged_code_is_reported_and_compiled_again(
     assert call_fresh() == 3.0
     assert capsys.readouterr().err == f"{file} is damaged; the function is compiled again\n"
     assert call_fresh() == 3.0
-    assert len(compiled_names) == 2
+    assert len(names) == 2
     assert list_files(tmp_path) == [file]
     assert file.is_file()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_readable", [True, False])
-def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
-    is_readable: bool, tmp_path: Path
-) -> None:
+def test_without_a_home_code_is_compiled_in_memory(is_readable: bool, tmp_path: Path) -> None:
     """A user without a home, and one whose HOME is another user's, as after `setpriv`."""
 
     def call() -> bool:
@@ -165,7 +156,7 @@ def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["cache", "cache/nasrem-rack"])
 def test_an_unwritable_cache_is_reported_once_with_a_remedy(
-    place: str, compiled_names: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    place: str, names: list[str], tmp_path: Path, capsys: Captured
 ) -> None:
     # A file in place of a folder: not even root can write into it.
     file = tmp_path / place
@@ -175,4 +166,4 @@ def test_an_unwritable_cache_is_reported_once_with_a_remedy(
     (line,) = capsys.readouterr().err.splitlines()
     assert "compiled code cannot be saved, so every launch compiles it again: " in line
     assert line.endswith("set XDG_CACHE_HOME to a folder that can be written")
-    assert len(compiled_names) == 3
+    assert len(names) == 3

@@ -35,12 +35,10 @@ class Answering(AnsweringStatus, version=1):
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
 
 
-def operator_reading(
-    serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW
-) -> Reading:
+def operator_reading(serial: int, what: Operation, goal: Goal = Goal.NONE) -> Reading:
     message = OperatorCommand.zeros({})
     message.id, message.what, message.goal = serial, what, goal
-    return Reading(message, verdict)
+    return Reading(message, Verdict.NEW)
 
 
 def report(orders: Orders, above: int = 0, message: Message | None = None) -> Message:
@@ -53,7 +51,9 @@ def report(orders: Orders, above: int = 0, message: Message | None = None) -> Me
 def test_a_command_stays_in_force_until_resume() -> None:
     orders = Orders(TAKES)
     assert orders.take_commands(operator_reading(3, Operation.HOLD))
-    assert not orders.take_commands(operator_reading(3, Operation.HOLD, verdict=Verdict.OLD))
+    assert not orders.take_commands(
+        operator_reading(3, Operation.HOLD)._replace(verdict=Verdict.OLD)
+    )
     assert orders.standing is Operation.HOLD
     assert orders.take_commands(operator_reading(5, Operation.RESUME))
     assert (orders.standing, orders.answer) == (Operation.NONE, Answer.DONE)
@@ -66,7 +66,7 @@ def test_a_command_stays_in_force_until_resume() -> None:
     ("what", "goal"),
     [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)],
 )
-def test_a_command_that_the_level_does_not_accept_is_refused_and_changes_nothing(
+def test_a_command_that_the_level_does_not_accept_changes_nothing(
     what: Operation, goal: Goal
 ) -> None:
     orders = Orders(TAKES)
@@ -75,11 +75,8 @@ def test_a_command_that_the_level_does_not_accept_is_refused_and_changes_nothing
     assert not orders.take_commands(operator_reading(2, what, goal))
     shown = report(orders)
     assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
-    name = f"{what.name} {goal.name}".lower()
-    assert (
-        shown.objection
-        == f"{name} is not a command of this level; permitted: hold, resume, goto joints|home"
-    )
+    name, permitted = f"{what.name} {goal.name}".lower(), "hold, resume, goto joints|home"
+    assert shown.objection == f"{name} is not a command of this level; permitted: {permitted}"
     # The torque still rests on the one before.
     assert shown.operator == 1
     unknown = operator_reading(3, Operation.NONE)
@@ -93,12 +90,8 @@ def test_the_level_holds_after_an_abandoned_command() -> None:
     orders.take_commands(operator_reading(5, Operation.GOTO, Goal.HOME))
     orders.abandon_command("out of reach")
     shown = report(orders)
-    assert (shown.standing, shown.answer, shown.objection) == (
-        Operation.HOLD,
-        Answer.REFUSED,
-        "out of reach",
-    )
-    assert shown.operator == 5
+    assert (shown.standing, shown.answer) == (Operation.HOLD, Answer.REFUSED)
+    assert (shown.objection, shown.operator) == ("out of reach", 5)
     orders.report_done()
     assert report(orders, message=shown).answer == Answer.REFUSED
 
@@ -120,15 +113,11 @@ def test_a_setting_does_not_replace_the_answer_to_the_command_in_force() -> None
     # Nor does it make the goto a command that is done.
     assert orders.answer is Answer.TAKEN
     # Nor does one that is refused.
-    orders.take_commands(
-        operator_reading(7, Operation.GOTO, Goal.JOINTS),
-        lambda message: orders.refuse_newest("too far"),
-    )
+    goto = operator_reading(7, Operation.GOTO, Goal.JOINTS)
+    orders.take_commands(goto, lambda message: orders.refuse_newest("too far"))
     orders.report_done()
-    assert {read_answer(orders), read_answer(orders)} == {
-        (5, Answer.DONE, ""),
-        (7, Answer.REFUSED, "too far"),
-    }
+    answers = {(5, Answer.DONE, ""), (7, Answer.REFUSED, "too far")}
+    assert {read_answer(orders), read_answer(orders)} == answers
     # A restarted board does none of them twice.
     assert find_answered_serial(report(orders)) == 6
 
@@ -148,10 +137,8 @@ def test_drives_that_finish_late_answer_the_command_that_started_them() -> None:
     orders = Orders(SETTING)
     orders.take_commands(operator_reading(5, Operation.HOLD))
     orders.take_commands(operator_reading(6, Operation.ENABLE))
-    assert [read_answer(orders), read_answer(orders)] == [
-        (5, Answer.TAKEN, ""),
-        (6, Answer.TAKEN, ""),
-    ]
+    for serial in (5, 6):
+        assert read_answer(orders) == (serial, Answer.TAKEN, "")
     orders.report_done()
     assert read_answer(orders) == (5, Answer.DONE, "")
     orders.report_completed(6)
@@ -167,9 +154,7 @@ def test_drives_that_finish_late_answer_the_command_that_started_them() -> None:
         ((np.nan, 1.0), "joint 'base' at nan rad; permitted: -1 to 1"),
     ],
 )
-def test_an_invalid_joint_goal_names_the_joint_and_its_range(
-    joints: tuple[float, ...], why: str
-) -> None:
+def test_an_invalid_joint_goal_names_the_joint(joints: tuple[float, ...], why: str) -> None:
     message = operator_reading(1, Operation.GOTO, Goal.JOINTS).message
     message.count = len(joints)
     message.joints[: len(joints)] = joints
@@ -223,9 +208,8 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
     # It has been passed down to the lowest level, and no level above knows of it.
     above = LEVELS.index(level)
-    assert [rack.read(f"{name}.status").operator for name in LEVELS] == above * [0] + (
-        4 - above
-    ) * [serial]
+    operators = [rack.read(f"{name}.status").operator for name in LEVELS]
+    assert operators == above * [0] + (4 - above) * [serial]
     # But each of them reports that it is held, and by whom.
     statuses = [rack.read(f"{name}.status") for name in LEVELS[: min(above, 2) + 1]]
     for shown in [s for s in statuses if s.state != State.DONE]:
@@ -249,10 +233,8 @@ def test_gotos_leave_a_free_motion_and_the_program_continues_afterwards() -> Non
     scene = rack.read("servo.scene")
     assert np.abs(scene.tool_position - ASIDE).max() < 5e-3
     assert rack.task.state == State.HOLDING
-    assert (
-        rack.task.reason
-        == "diverted by the operator: goto direction done; `resume` continues the program"
-    )
+    why = "diverted by the operator: goto direction done; `resume` continues the program"
+    assert rack.task.reason == why
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)

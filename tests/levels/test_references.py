@@ -12,14 +12,12 @@ import pytest
 from rack.levels.references import import_reference
 from tests.processes import BOUND_S, FORKS, children_of, descriptors
 
+ENDED = "ImportError: it ended the process:"
 ENDING = {
-    "leaves": ("import os; os._exit(5)", "ImportError: it ended the process: exit status 5"),
-    "leaves_well": ("import os; os._exit(0)", "ImportError: it ended the process: exit status 0"),
-    "is_killed": (
-        "import os; os.kill(os.getpid(), 9)",
-        "ImportError: it ended the process: signal SIGKILL",
-    ),
-    "interrupts": ("raise KeyboardInterrupt", "ImportError: it ended the process: exit status 1"),
+    "leaves": ("import os; os._exit(5)", f"{ENDED} exit status 5"),
+    "leaves_well": ("import os; os._exit(0)", f"{ENDED} exit status 0"),
+    "is_killed": ("import os; os.kill(os.getpid(), 9)", f"{ENDED} signal SIGKILL"),
+    "interrupts": ("raise KeyboardInterrupt", f"{ENDED} exit status 1"),
     "exits": ("raise SystemExit(7)", "SystemExit: 7"),
     "raises": ("1 / 0", "ZeroDivisionError: division by zero"),
     "loops": ("while True: pass", "ImportError: it did not finish within 0.5 s"),
@@ -30,10 +28,7 @@ ENDING = {
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("name", ENDING)
 def test_a_module_cannot_end_or_block_the_process_that_checks_a_config(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("rack.levels.references.SLOW_S", 0.2)
     monkeypatch.setattr("rack.levels.references.MAX_IMPORT_S", 0.5)
@@ -61,11 +56,6 @@ def test_output_of_an_imported_module_is_printed_once(tmp_path: Path) -> None:
         "references.import_reference('it_prints:Level')",
     ]
     # Unbuffered, as in the processes of a rack.
-    done = subprocess.run(
-        [sys.executable, "-u", "-c", "; ".join(lines)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-    )
+    command = [sys.executable, "-u", "-c", "; ".join(lines)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S)
     assert (done.stdout, done.stderr) == ("here\n", "")

@@ -1,5 +1,4 @@
-"""The world model: poses, velocities, and a revision that rises when a body starts or stops
-moving."""
+"""The world model: poses, velocities, and a revision that rises when motion starts or ends."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ class WorldRig:
         return cast(Message, self.rack.tasks["world"].written["model"])
 
     def run(self, seconds: float, poses: Poses | None) -> list[int]:
-        """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions
-        that were seen."""
+        """Run with a scene of `poses` every tick, if given; return the revisions seen."""
         revisions = [self.model.revision]
         for _ in range(round(seconds / TICK_S)):
             if poses is not None:
@@ -72,9 +70,8 @@ def test_bodies_at_rest_keep_one_revision_and_have_no_velocity() -> None:
     assert not rig.model.quaternion.any()
     rig.run(0.1, resting)
     first = rig.model.revision
-    assert rig.run(
-        2.0, lambda _: (START + rng.normal(0.0, 2e-5, (3, 3)), np.tile(UPRIGHT, (3, 1)))
-    ) == [first]
+    tiles = np.tile(UPRIGHT, (3, 1))
+    assert rig.run(2.0, lambda _: (START + rng.normal(0.0, 2e-5, (3, 3)), tiles)) == [first]
     assert not rig.model.velocity.any()
     assert rig.model.position == pytest.approx(START, abs=2e-4)
 
@@ -82,9 +79,8 @@ def test_bodies_at_rest_keep_one_revision_and_have_no_velocity() -> None:
 def test_the_revision_rises_when_a_body_starts_and_when_it_rests_again() -> None:
     rig, slide = WorldRig(), sliding(1.0, 1.5, 0.25)
     revisions = rig.run(1.4, slide)
-    assert rig.model.velocity == pytest.approx(
-        np.array([[0.25, 0, 0], [0, 0, 0], [0, 0, 0]]), abs=1e-9
-    )
+    velocity = np.array([[0.25, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert rig.model.velocity == pytest.approx(velocity, abs=1e-9)
     assert rig.model.position[0, 0] == pytest.approx(0.5 + 0.25 * 0.4, abs=0.26 * PERIOD * TICK_S)
     revisions += rig.run(1.6, slide)[1:]
     assert len(revisions) == 4  # none, first scene, start, rest

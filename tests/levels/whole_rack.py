@@ -14,8 +14,7 @@ from tests.levels.lockstep import BoardSpec, Lockstep
 
 
 class WholeRack(Lockstep):
-    """All boards of config `name`; with `arm`, on another arm and cell, with `actions` another
-    program."""
+    """All boards of config `name`, perhaps with another arm and cell, or other actions."""
 
     def __init__(
         self,
@@ -47,8 +46,7 @@ class WholeRack(Lockstep):
         return self.read("primitive.status")
 
     def run_to_end(self, most_s: float) -> Message:
-        """Run until the task is done or has failed, at most `most_s` simulated seconds; return its
-        status."""
+        """Run until the task is done or has failed, at most `most_s`, s; return its status."""
         self.run(most_s, lambda rack: rack.read("task.status").state in (State.DONE, State.ERROR))
         return self.task
 

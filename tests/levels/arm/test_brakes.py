@@ -1,5 +1,4 @@
-"""The brakes of the simulated arm: they act without the motors, close by themselves, and keep the
-limits."""
+"""The brakes of the simulated arm act without motors, engage by themselves, and keep the limits."""
 
 from __future__ import annotations
 
@@ -9,23 +8,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
-from rack.levels.messages import ArmState
-from rack.levels.robot.cell import Cell, compute_sizes
+from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from tests.levels.arms import CLOCK_NS, cell, config
+from tests.levels.arms import CLOCK_NS, cell, config, save_state
+
+Torque = Callable[[], Array]
 
 
-def build_moving_arm(
-    name: str = "puma560", every: int = 1
-) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:
+def build_moving_arm(every: int = 1) -> tuple[SimulatedArm, Cell, Torque]:
     """Return an arm under way, and torques that would keep it under way."""
-    made = cell(name)
+    made = cell("puma560")
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    arm, dynamics = SimulatedArm(made, config(name)[1], CLOCK_NS, every), Dynamics(made)
+    arm, dynamics = SimulatedArm(made, config("puma560")[1], CLOCK_NS, every), Dynamics(made)
     side = np.where(np.arange(len(made.home)) % 2, -1.0, 1.0) * made.limits.acceleration
 
     def torque() -> Array:
@@ -42,7 +39,7 @@ def build_moving_arm(
 
 @pytest.mark.parametrize("every", [1, 3])
 def test_the_brakes_engage_after_two_torque_cycles_without_a_command(every: int) -> None:
-    arm, _, torque = build_moving_arm(every=every)
+    arm, _, torque = build_moving_arm(every)
     arm.drive(torque(), 0.0)
     arm.step(2 * every)
     assert not arm.braked
@@ -69,23 +66,18 @@ def test_engaged_brakes_stop_and_hold_an_arm_with_all_motors_off() -> None:
 
 
 def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
-    arm, made, _ = build_moving_arm()
+    arm, _, _ = build_moving_arm()
     arm.brake()
     arm.step(30)
     arm.brake()
-    saved = ArmState.zeros(compute_sizes(made))
-    arm.save(saved)
+    saved = save_state(arm)
     again = SimulatedArm(cell("puma560"), config("puma560")[1], CLOCK_NS)
     again._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     again.restore(saved)
-    ends = []
     for one in (arm, again):
         one.step(300)
-        end = Message(saved.record.dtype)
-        one.save(end)
-        ends.append(end.raw)
     assert saved.braked == 1
-    assert ends[0] == ends[1]
+    assert save_state(arm).raw == save_state(again).raw
 
 
 @pytest.mark.parametrize(

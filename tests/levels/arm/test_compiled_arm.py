@@ -1,5 +1,4 @@
-"""The compiled functions of the arm: the same bits as their Python, and one version for all
-robots."""
+"""The compiled functions of the arm: the bits of their Python, and one version for all robots."""
 
 from __future__ import annotations
 
@@ -15,12 +14,12 @@ from rack.levels import arm as arm_package
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, drives, sensors, substeps
 from rack.levels.compiled import compiled
-from rack.levels.messages import ArmState, Scene
+from rack.levels.messages import Scene
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.robot.limits import Encoders
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar
+from tests.levels.arms import CLOCK_NS, cell, config, four_bar, save_state
 
 RNG = np.random.default_rng(8)
 OFFSET = np.array([0.02, -0.03, 0.05])
@@ -33,9 +32,7 @@ def drive_cycles(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
         bias = arm.dynamics.terms(sensed.position, sensed.velocity).bias
         arm.drive(bias + 0.3 * made.bounds.torque * np.sin(0.1 * tick + np.arange(len(bias))), 10.0)
         arm.step(1)
-    state = ArmState.zeros(compute_sizes(made))
-    arm.save(state)
-    return state
+    return save_state(arm)
 
 
 def scene(arm: SimulatedArm, made: Cell) -> Message:
@@ -69,9 +66,8 @@ def test_the_equation_of_motion_is_the_same_as_in_python(name: str) -> None:
     other._evaluate, other._carry = dynamics.evaluate_terms, dynamics.add_payload
     for q, qd in RNG.uniform(-1.0, 1.0, (20, 2, len(made.qpos))):
         for payload in (None, Payload(1.5, OFFSET)):
-            for mine, theirs in zip(
-                one.terms(q, qd, payload), other.terms(q, qd, payload), strict=True
-            ):
+            pairs = zip(one.terms(q, qd, payload), other.terms(q, qd, payload), strict=True)
+            for mine, theirs in pairs:
                 assert np.array_equal(mine, theirs)
 
 
@@ -92,19 +88,15 @@ def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
 def draw_samples(tick: int) -> Array:
     """Return the noise of a tick in standard deviations, (2, joints)."""
     encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
-    return sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [
-        [1e-3],
-        [1e-2],
-    ]
+    sample = sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick)
+    return sample / [[1e-3], [1e-2]]
 
 
 def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> None:
     arm_package.preload()
     four = four_bar(tmp_path)
-    for made, surroundings in (
-        (cell("puma560"), config("puma560")[1]),
-        (build_cell(*four, CLOCK_NS), four[1]),
-    ):
+    puma = cell("puma560"), config("puma560")[1]
+    for made, surroundings in (puma, (build_cell(*four, CLOCK_NS), four[1])):
         arm = SimulatedArm(made, surroundings, CLOCK_NS)
         arm.dynamics.terms(made.home, np.zeros(6), Payload(1.0, OFFSET))
         drive_cycles(arm, made, 3)

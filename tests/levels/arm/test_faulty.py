@@ -1,7 +1,8 @@
-"""Faults between servo level and arm: their effect, their joint, and their repetition with the same
-seed."""
+"""Faults between servo level and arm: effect, joint, and repetition with the same seed."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -11,21 +12,21 @@ from rack.boards.faults import KINDS
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.level import Fault
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
 
-def build_link(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
-    made, acted = cell("puma560"), dict[int, bool]()
-    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
-    link = FaultyLink(arm, acted)
+def build_link(
+    *faults: Fault, **held: Callable[[], bool]
+) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
+    arm, acted = SimulatedArm(cell("puma560"), config("puma560")[1], CLOCK_NS), dict[int, bool]()
+    link = FaultyLink(arm, acted, **held)
     link.inject(faults)
     return link, arm, acted
 
 
-def build_fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
-    return Fault(kind, parameters, seed, 0, KINDS[kind].step)
+def build_fault(kind: str, **parameters: float) -> Fault:
+    return Fault(kind, parameters, 7, 0, KINDS[kind].step)
 
 
 HOLDING = Dynamics(cell("puma560")).terms(cell("puma560").home, np.zeros(6)).bias.copy()
@@ -36,9 +37,8 @@ def test_a_sensor_fault_affects_only_its_joint() -> None:
     assert link.sense().position - arm.sense().position == pytest.approx([0, 0, 0.3, 0, 0, 0])
     assert acted == {0: True}
     # An arm may lack the joint.
-    link, arm, acted = build_link(
-        build_fault("sensor-nan", joint=9), build_fault("actuator-off", joint=9)
-    )
+    faults = build_fault("sensor-nan", joint=9), build_fault("actuator-off", joint=9)
+    link, arm, acted = build_link(*faults)
     assert np.array_equal(link.sense().position, arm.sense().position)
     link.drive(HOLDING, 0.0)
     assert acted == {}
@@ -102,33 +102,26 @@ def test_faults_on_one_arm_combine_and_each_is_recorded() -> None:
 
 @pytest.mark.parametrize("says_held", [False, True])
 @pytest.mark.parametrize(
-    ("blocks", "more", "shows"),
+    ("blocks", "more", "is_shown"),
     [(0, 0.0, True), (1, 0.0, False), (1, 20.0, True), (2, 20.0, False)],
 )
-def test_a_motor_that_is_off_is_detectable_later_if_a_resting_arm_carries_a_load(
-    blocks: int, more: float, shows: bool, says_held: bool
+def test_a_dead_motor_shows_later_under_a_load(
+    blocks: int, more: float, is_shown: bool, says_held: bool
 ) -> None:
-    made, acted = cell("puma560"), dict[int, bool]()
-    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
-    lay_against_a_finger(made, arm, blocks)
+    link, arm, acted = build_link(build_fault("actuator-off", joint=1), holds=lambda: says_held)
+    lay_against_a_finger(arm, blocks)
     assert (arm.is_holding_object, arm.is_touching_surroundings) == (blocks > 0, blocks > 1)
-    link = FaultyLink(arm, acted, holds=lambda: says_held)
-    link.inject([build_fault("actuator-off", joint=1)])
     link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
     # Its level may take a part for held that the arm does not hold.
-    assert acted == {0: shows and (blocks > 0 or not says_held)}
+    assert acted == {0: is_shown and (blocks > 0 or not says_held)}
 
 
-def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
-    """Put a block where one finger is, so that it is held, and another so that it touches the first
-    alone."""
-    data = arm._data
+def lay_against_a_finger(arm: SimulatedArm, blocks: int) -> None:
+    """Put a block where one finger is, so that it is held, and another that touches the first."""
+    made, data = arm.cell, arm._data
     mujoco.mj_forward(made.model, data)
-    finger = next(
-        int(geom)
-        for geom in made.geoms.gripper
-        if made.model.geom(int(geom)).name.startswith("pad")
-    )
+    names = {made.model.geom(int(geom)).name: int(geom) for geom in made.geoms.gripper}
+    finger = next(geom for name, geom in names.items() if name.startswith("pad"))
     place = data.geom_xpos[finger].copy()
     for nth, body in enumerate(made.bodies[:blocks]):
         address = made.model.jnt_qposadr[made.model.body_jntadr[body]]

@@ -22,8 +22,7 @@ from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.servo.rig import Course, ServoRig
 
-ROOT = Path(__file__).resolve().parents[3]
-EXAMPLE = ROOT / "configs" / "examples" / "own-hardware"
+EXAMPLE = Path(__file__).resolve().parents[3] / "configs/examples/own-hardware/hardware.toml"
 TICK_S = CLOCK_NS * 1e-9
 
 
@@ -45,14 +44,11 @@ class CoarseArm(IdealArm):
 
     def sense(self) -> Sensed:
         sample = super().sense()
-        encoders = self.cell.encoders
-        way = np.where(
-            np.random.default_rng(self.tick).random((2, len(encoders.position_error))) < 0.5, -1, 1
-        )
-        return sample._replace(
-            position=sample.position + way[0] * encoders.position_error,
-            velocity=sample.velocity + way[1] * encoders.velocity_error,
-        )
+        error = self.cell.encoders
+        random = np.random.default_rng(self.tick)
+        way = np.where(random.random((2, len(error.position_error))) < 0.5, -1, 1)
+        q, qd = way * (error.position_error, error.velocity_error)
+        return sample._replace(position=sample.position + q, velocity=sample.velocity + qd)
 
 
 def drive_cycles(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
@@ -88,6 +84,10 @@ def random_torques(cell: Cell, seed: int, cycles: int) -> Iterator[Array]:
         yield torque
 
 
+def own_cell(folder: Path) -> Cell:
+    return build_cell(pendulum(folder), SceneConfig(), CLOCK_NS)
+
+
 @pytest.mark.slow
 def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
@@ -103,8 +103,7 @@ def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: 
 
 @pytest.mark.slow
 def test_missed_cycles_do_not_lead_beyond_a_limit(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path)
-    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    cell = own_cell(tmp_path)
     random = np.random.default_rng(0)
 
     def moved(is_guarded: bool) -> float:
@@ -128,13 +127,9 @@ def test_missed_cycles_do_not_lead_beyond_a_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sample", [(np.nan, 0.0), (0.0, np.nan), (np.inf, 0.0)])
-def test_an_arm_is_not_driven_on_a_sample_that_is_not_finite(
-    tmp_path: Path, sample: tuple[float, float]
-) -> None:
-    robot = pendulum(tmp_path)
-    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+def test_a_sample_that_is_not_finite_brakes(tmp_path: Path, sample: tuple[float, float]) -> None:
     FarArm.jumps = {1: sample}
-    arm = FarArm(cell, SceneConfig(), CLOCK_NS)
+    arm = FarArm(own_cell(tmp_path), SceneConfig(), CLOCK_NS)
     arm.enable()
     guard = GuardedArm(arm, TICK_S)
     guard.sense()
@@ -172,7 +167,7 @@ class LyingArm(IdealArm):
 
 
 @pytest.mark.parametrize("lie", ["sticks", "stalls", "jumps", "drifts", "claims"])
-def test_an_arm_whose_samples_become_wrong_in_full_motion_is_braked_within_its_limits(
+def test_an_arm_whose_samples_become_wrong_is_braked_within_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lie: str
 ) -> None:
     monkeypatch.setattr(LyingArm, "lie", lie)
@@ -201,7 +196,7 @@ def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("jump", "what"), [((9.0, 0.0), "position"), ((0.0, 99.0), "velocity")])
-def test_a_sample_beyond_a_limit_is_reported_and_counted_and_engages_the_brakes(
+def test_a_sample_beyond_a_limit_engages_the_brakes(
     tmp_path: Path, jump: tuple[float, float], what: str
 ) -> None:
     servo = rig(tmp_path, dict.fromkeys(range(100, 103), jump))
@@ -214,7 +209,6 @@ def test_a_sample_beyond_a_limit_is_reported_and_counted_and_engages_the_brakes(
     assert arm.violations == 3
     assert arm.first_violation.startswith(f"{what} ")
     assert "as sensed; permitted: " in arm.first_violation
-    assert Alarm.LIMIT_EXCEEDED in servo.alarms()
     assert servo.alarms().count(Alarm.LIMIT_EXCEEDED) == 1
     servo.run(1200, course.at)
     assert servo.status.violations == 3
@@ -226,8 +220,7 @@ def test_a_sample_beyond_a_limit_is_reported_and_counted_and_engages_the_brakes(
 
 @pytest.mark.slow
 def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path)
-    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
+    cell = own_cell(tmp_path)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, TICK_S, speed_fraction=0.1)
     _, slow = drive_cycles(guard, arm, random_torques(cell, 0, 800))
@@ -240,9 +233,8 @@ def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
 
 
 def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> None:
-    config = load(EXAMPLE / "hardware.toml", ["robot.bring_up=0.001"])
     with pytest.raises(ConfigError) as refused:
-        resolve_layout(config)
+        resolve_layout(load(EXAMPLE, ["robot.bring_up=0.001"]))
     (mistake,) = refused.value.mistakes
     assert (mistake.place, mistake.value) == ("board.servo.params.arm", "hardware_arm:HardwareArm")
     assert mistake.why == (

@@ -25,6 +25,7 @@ from tests.levels.lockstep import CLOCK_NS
 from tests.levels.servo.rig import Course, ServoRig
 
 COURSE = Course(START, GOAL, 0.8)
+LATE = f"{__name__}:LateArm"
 
 
 class LateArm(IdealArm):
@@ -70,20 +71,18 @@ def arm() -> type[LateArm]:
 
 
 def build_late_arm(folder: Path, ticks: int) -> tuple[RobotConfig, Cell]:
-    robot = pendulum(folder).model_copy(update={"latency_ticks": ticks})
+    robot = pendulum(folder, latency_ticks=ticks)
     return robot, build_cell(robot, SceneConfig(), CLOCK_NS)
 
 
-def rig(
-    folder: Path, latency: int, name: str = "tests.levels.arm.test_latency_compensation:LateArm"
-) -> ServoRig:
+def rig(folder: Path, latency: int, name: str = LATE) -> ServoRig:
     params = {"arm": name} if name else {}
     return ServoRig(build_late_arm(folder, latency)[0], SceneConfig(), **params)
 
 
 @pytest.mark.parametrize("ticks", [1, 3])
 @pytest.mark.parametrize("age", [0, 1, 3])
-def test_a_sample_is_extrapolated_to_the_present_if_it_is_not_too_old(
+def test_a_sample_is_extrapolated_if_it_is_not_too_old(
     tmp_path: Path, arm: type[LateArm], ticks: int, age: int
 ) -> None:
     _, cell = build_late_arm(tmp_path, ticks)
@@ -113,7 +112,7 @@ def test_a_late_arm_follows_its_set_points_without_an_alarm(
     tmp_path: Path, arm: type[LateArm], latency: int, simulated: bool
 ) -> None:
     arm.late = latency
-    servo = rig(tmp_path, latency, "" if simulated else f"{__name__}:LateArm")
+    servo = rig(tmp_path, latency, "" if simulated else LATE)
     assert isinstance(servo.servo.arm, SimulatedArm if simulated else LateArm)
     servo.run(400, COURSE.at)
     assert servo.servo.arm.tick - servo.servo.arm.sense().tick == latency
@@ -127,7 +126,7 @@ def test_a_late_arm_follows_its_set_points_without_an_alarm(
 
 
 @pytest.mark.parametrize(("age", "latency"), [(1, 0), (3, 2), (4, 0)])
-def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
+def test_samples_that_are_too_old_are_a_finding_with_their_age(
     tmp_path: Path, arm: type[LateArm], age: int, latency: int
 ) -> None:
     arm.late = age
@@ -139,9 +138,8 @@ def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
     assert found.tick == 1
     assert servo.status.braked
     assert servo.status.error == Error.NONE
-    assert servo.status.reason.startswith(
-        f"the newest sample is {age} ticks old; permitted by robot.latency_ticks: {latency}"
-    )
+    assert servo.status.reason.startswith(f"the newest sample is {age} ticks old; permitted by ")
+    assert f"permitted by robot.latency_ticks: {latency}" in servo.status.reason
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from tests.levels.servo.rig import Course, ServoRig
 
 START, GOAL = np.array([0.0, 0.5]), np.array([0.6, -0.4])
 SUBSTEPS = 10
+HERE = f"{__name__}:"
 
 
 class IdealArm(Arm):
@@ -78,7 +79,7 @@ class HalfAnArm(Arm):
 
 @pytest.fixture
 def rig(tmp_path: Path) -> ServoRig:
-    return ServoRig(pendulum(tmp_path), SceneConfig(), arm="tests.levels.arm.test_own_arm:IdealArm")
+    return ServoRig(pendulum(tmp_path), SceneConfig(), arm=HERE + "IdealArm")
 
 
 @pytest.mark.slow
@@ -107,18 +108,9 @@ def test_a_restarted_board_restores_the_arm(rig: ServoRig) -> None:
     ("reference", "why"),
     [
         ("nobody:Arm", "cannot import 'nobody': ModuleNotFoundError: No module named 'nobody'"),
-        (
-            "tests.levels.arm.test_own_arm:Missing",
-            "module 'tests.levels.arm.test_own_arm' has no class 'Missing'",
-        ),
-        (
-            "rack.levels.arm:Sensed",
-            "module 'rack.levels.arm' has no Arm named 'Sensed'; it has: ",
-        ),
-        (
-            "tests.levels.arm.test_own_arm:HalfAnArm",
-            "class 'HalfAnArm' does not implement: brake, step",
-        ),
+        (HERE + "Missing", f"module '{__name__}' has no class 'Missing'"),
+        ("rack.levels.arm:Sensed", "module 'rack.levels.arm' has no Arm named 'Sensed'; it has: "),
+        (HERE + "HalfAnArm", "class 'HalfAnArm' does not implement: brake, step"),
     ],
 )
 def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:

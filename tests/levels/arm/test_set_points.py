@@ -1,16 +1,15 @@
-"""Arms whose drives follow set points keep their limits, whatever the set points are, and whoever
-made the drives."""
+"""Arms whose drives follow set points keep their limits, whatever the set points are."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, solve
 from rack.levels.arm import Arm, JointTarget, SimulatedArm
@@ -18,27 +17,38 @@ from rack.levels.arm import simulated as simulated_arm
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.simulated import CascadedDrives
 from rack.levels.level import Finding
-from rack.levels.messages import ArmState
-from rack.levels.robot.cell import Cell, build_cell, compute_sizes
+from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import Interface, SceneConfig
 from tests.levels.arm.test_own_arm import SUBSTEPS, IdealArm
-from tests.levels.arms import CLOCK_NS, config, pendulum
+from tests.levels.arms import CLOCK_NS, config, pendulum, save_state
 
 TICK_S = CLOCK_NS * 1e-9
 SET_POINTS: tuple[Interface, ...] = ("position", "velocity")
 KINDS = ("jumps", "swings", "ramps", "beyond")
 
 
+@pytest.fixture(params=SET_POINTS)
+def interface(request: pytest.FixtureRequest) -> Interface:
+    return cast(Interface, request.param)
+
+
+@pytest.fixture(params=[False, True], ids=["simulated", "own"])
+def link(request: pytest.FixtureRequest, tmp_path: Path, interface: Interface) -> Link:
+    """An arm, and what drives it."""
+    if request.param:
+        return build_guarded(tmp_path, interface)
+    arm, _ = build_simulated("puma560", interface)
+    return arm, arm
+
+
 class ServoArm(IdealArm):
     """An arm of one's own with position or velocity servos, which know limits of torque alone."""
 
-    def __init__(
-        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
-    ) -> None:
-        super().__init__(cell, scene, clock_ns, every, seed)
-        self._rows = np.zeros((3, len(cell.home)))
-        steps = every * SUBSTEPS
-        self._servos = CascadedDrives(cell, self._dynamics, self._step_s, steps, self._rows)
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._rows = np.zeros((3, len(self.cell.home)))
+        drives = self.cell, self._dynamics, self._step_s, self.every * SUBSTEPS, self._rows
+        self._servos = CascadedDrives(*drives)
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         self._rows[:2] = target.position, target.velocity
@@ -53,9 +63,8 @@ class ServoArm(IdealArm):
             if self.waited >= self.patience:
                 self.brake()
             for step in range(0 if self.braked else SUBSTEPS):
-                torque = self._servos.compute_torque(
-                    self._q, self._qd, SUBSTEPS * self.waited + step
-                )
+                now = SUBSTEPS * self.waited + step
+                torque = self._servos.compute_torque(self._q, self._qd, now)
                 inertia, bias = self._dynamics.terms(self._q, self._qd)
                 self._qd += self._step_s * solve(inertia, torque - bias)
                 self._q += self._step_s * self._qd
@@ -76,18 +85,9 @@ def build_guarded(folder: Path, interface: Interface) -> tuple[ServoArm, Guarded
     return arm, GuardedArm(arm, TICK_S)
 
 
-def build_link(folder: Path, interface: Interface, is_own: bool) -> tuple[Arm, Arm | GuardedArm]:
-    if is_own:
-        return build_guarded(folder, interface)
-    arm, _ = build_simulated("puma560", interface)
-    return arm, arm
-
-
-def draw_hostile_targets(
-    cell: Cell, kind: str, cycles: int, seed: int = 3
-) -> Iterator[JointTarget]:
+def draw_hostile_targets(cell: Cell, kind: str, cycles: int) -> Iterator[JointTarget]:
     """Yield set points that no level would give, after one where the arm starts."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(3)
     low, high = np.clip(cell.bounds.position.T, -3.0, 3.0)
     fastest = cell.bounds.velocity
     holding = compute_load(cell)
@@ -109,24 +109,18 @@ def draw_hostile_targets(
         yield JointTarget(position, velocity, holding)
 
 
+Link = tuple[Arm, Arm | GuardedArm]
+
+
 def compute_load(cell: Cell) -> Array:
     """Return the torques, N m, that hold the arm at home."""
     data = cell.build_start_data()
     return np.asarray(data.qfrc_bias - data.qfrc_passive)[cell.dof]
 
 
-def save_state(arm: SimulatedArm) -> Message:
-    state = ArmState.zeros(compute_sizes(arm.cell))
-    arm.save(state)
-    return state
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
-    interface: Interface, kind: str
-) -> None:
+def test_no_set_points_exceed_limits_of_the_simulated_arm(interface: Interface, kind: str) -> None:
     arm, made = build_simulated("puma560", interface)
     fastest = 0.0
     for target in draw_hostile_targets(made, kind, 400):
@@ -140,8 +134,7 @@ def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["jumps", "beyond"])
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_no_set_points_move_a_guarded_arm_beyond_its_limits_when_cycles_are_missed(
+def test_no_set_points_exceed_limits_of_a_guarded_arm_that_misses_cycles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str
 ) -> None:
     # Its drives cycle at 4 kHz, so they may be quick.
@@ -167,8 +160,6 @@ def test_no_set_points_move_a_guarded_arm_beyond_its_limits_when_cycles_are_miss
     assert beyond(is_guarded=False) > 0.1
 
 
-@pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize("is_own", [False, True])
 @pytest.mark.parametrize(
     ("wrong", "alarm"),
     [
@@ -178,51 +169,44 @@ def test_no_set_points_move_a_guarded_arm_beyond_its_limits_when_cycles_are_miss
         ({"torque": 1e4}, Alarm.COMMAND_LIMIT),
     ],
 )
-def test_an_invalid_set_point_engages_the_brakes(
-    tmp_path: Path, interface: Interface, is_own: bool, wrong: dict[str, float], alarm: Alarm
-) -> None:
-    arm, link = build_link(tmp_path, interface, is_own)
+def test_an_invalid_set_point_brakes(link: Link, wrong: dict[str, float], alarm: Alarm) -> None:
+    arm, driven = link
     good = JointTarget(arm.cell.home, 0.0 * arm.cell.home, compute_load(arm.cell))
-    link.sense()
-    assert link.follow(good, 0.0) is None
+    driven.sense()
+    assert driven.follow(good, 0.0) is None
     assert not arm.braked
     arm.step(1)
-    link.sense()
+    driven.sense()
     ((field, value),) = wrong.items()
     bad = getattr(good, field).copy()
     bad[1] = value
-    refused = link.follow(good._replace(**{field: bad}), 0.0)
+    refused = driven.follow(good._replace(**{field: bad}), 0.0)
     assert refused is not None
     assert (refused.alarm, refused.subject) == (alarm, 1)
     assert (arm.braked, arm.clipped) == (True, 1)
     # The next good one is followed again.
-    link.sense()
-    assert link.follow(good, 0.0) is None
+    driven.sense()
+    assert driven.follow(good, 0.0) is None
 
 
-@pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize("is_own", [False, True])
-def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(
-    tmp_path: Path, interface: Interface, is_own: bool
-) -> None:
-    arm, link = build_link(tmp_path, interface, is_own)
+def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(link: Link) -> None:
+    arm, driven = link
     there = arm.cell.home.copy()
     there[1] += 0.02
     away = JointTarget(there, 0.0 * there, compute_load(arm.cell))
     for _ in range(3):
-        link.sense()
-        refused = link.follow(away, 0.0)
+        driven.sense()
+        refused = driven.follow(away, 0.0)
         assert refused is not None
         assert (refused.alarm, refused.subject) == (Alarm.SET_POINT, 1)
         assert refused.value == pytest.approx(0.02, abs=1e-3)
         assert arm.braked
         arm.step(1)
-    link.sense()
-    assert link.follow(away._replace(position=link.sense().position), 0.0) is None
+    driven.sense()
+    assert driven.follow(away._replace(position=driven.sense().position), 0.0) is None
     assert not arm.braked
 
 
-@pytest.mark.parametrize("interface", SET_POINTS)
 @pytest.mark.parametrize("missed", [0, 1, 5])
 def test_a_restored_arm_continues_bit_for_bit(interface: Interface, missed: int) -> None:
     arm, made = build_simulated("puma560", interface)

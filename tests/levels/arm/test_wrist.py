@@ -10,9 +10,9 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
-from rack.levels.messages import ArmState
-from rack.levels.robot.cell import build_cell, compute_sizes
+from rack.levels.robot.cell import build_cell
 from rack.levels.systems.force.arm_executor import compute_contact
+from tests.levels.arms import save_state
 from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
@@ -32,36 +32,27 @@ def sense_wrist(arm: SimulatedArm) -> Array:
 
 
 def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
-    """Push the tool, at the tool's site, with a force, N, and a torque, N m, from the next step
-    on."""
+    """Push the tool at its site with a force, N, and a torque, N m, from the next step on."""
     cell, data = arm.cell, arm._data
     applied = np.zeros(cell.model.nv)
     body = cell.model.site_bodyid[cell.tool]
     centre, site = data.xipos[body], data.site_xpos[cell.tool]
     mujoco.mj_applyFT(cell.model, data, force, torque, site, body, applied)
-    data.xfrc_applied[body, :3], data.xfrc_applied[body, 3:] = (
-        force,
-        torque + np.cross(site - centre, force),
-    )
+    data.xfrc_applied[body, :3] = force
+    data.xfrc_applied[body, 3:] = torque + np.cross(site - centre, force)
 
 
 @pytest.mark.parametrize(
     "home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)]
 )
-def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
-    tmp_path: Path, home: tuple[float, ...]
-) -> None:
-    arm, force, torque = (
-        build_arm(tmp_path, home),
-        np.array([5.0, -9.0, 12.0]),
-        np.array([0.4, 0.3, -0.2]),
-    )
+def test_a_push_on_the_tool_is_the_wrench(tmp_path: Path, home: tuple[float, ...]) -> None:
+    arm = build_arm(tmp_path, home)
+    force, torque = np.array([5.0, -9.0, 12.0]), np.array([0.4, 0.3, -0.2])
     for _ in range(200):
         push(arm, force, torque)
         arm.step(1)
-    wrench, felt = compute_contact(
-        arm.cell, arm.dynamics, sense_wrist(arm), np.array(arm._state), STILL
-    )
+    sensed, state = sense_wrist(arm), np.array(arm._state)
+    wrench, felt = compute_contact(arm.cell, arm.dynamics, sensed, state, STILL)
     assert np.allclose(wrench, (*force, *torque), atol=0.02)
     jacobian = np.zeros((6, arm.cell.model.nv))
     mujoco.mj_jacSite(arm.cell.model, arm._data, jacobian[:3], jacobian[3:], arm.cell.tool)
@@ -71,12 +62,10 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
 
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms = [build_arm(tmp_path, noise=0.2) for _ in range(2)]
-    state = ArmState.zeros(compute_sizes(arms[0].cell))
     for _ in range(40):
         arms[0].drive(arms[0].dynamics.terms(*arms[0]._state).bias, 0.0)
         arms[0].step(1)
-    arms[0].save(state)
-    arms[1].restore(state)
+    arms[1].restore(save_state(arms[0]))
     for arm in arms:
         arm.step(1)
     assert sense_wrist(arms[0]).tobytes() == sense_wrist(arms[1]).tobytes()

@@ -9,6 +9,8 @@ from rack.backplane.message import State
 from rack.levels.tables import MotionConfig
 from tests.levels.whole_rack import WholeRack
 
+pytestmark = pytest.mark.slow
+
 TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 ABOVE_BLOCK = {"do": "goto", "position": [0.5, 0.3, 0.6]}
 HOME = {"do": "home"}
@@ -16,16 +18,12 @@ GOAL = np.array(TRANSFER["to"])
 BLOCK1, POST = 0, 3
 
 
-def post_moves(
-    *legs: tuple[float, tuple[float, float, float]], speed: float = 0.25
-) -> list[MotionConfig]:
-    """Bring the post to the height of the arm, out of its reach, then along `legs`: time and
-    place."""
+def post_moves(*legs: tuple[float, tuple[float, float, float]]) -> list[MotionConfig]:
+    """Bring the post to the height of the arm, out of its reach, then along `legs`: time, place."""
     first = MotionConfig(body="post", at=1.0, to=(legs[0][1][0], 0.85, legs[0][1][2]), speed=1.0)
-    return [first, *(MotionConfig(body="post", at=at, to=to, speed=speed) for at, to in legs)]
+    return [first, *(MotionConfig(body="post", at=at, to=to, speed=0.25) for at, to in legs)]
 
 
-@pytest.mark.slow
 def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> None:
     rack = WholeRack(actions=[TRANSFER, HOME])
     seen: list[tuple[int, bool]] = []
@@ -39,8 +37,7 @@ def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> N
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.002)
     assert rack.read("servo.status").touches == 0
     assert rack.move.replans == 0
-    # Between two segments the primitive level may be without work for some of its cycles, not for
-    # one of this level's.
+    # Between segments the primitive level may be idle for some of its cycles, not one of these.
     begun = next(k for k, (_, busy) in enumerate(seen) if busy)
     last = max(done for done, _ in seen)
     ended = next(k for k, (done, _) in enumerate(seen) if done == last)
@@ -51,18 +48,15 @@ def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> N
     assert longest * 10 < 100
 
 
-@pytest.mark.slow
 def test_another_path_avoids_an_obstacle_that_moves_into_the_way() -> None:
-    rack = WholeRack(
-        arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9)))
-    )
+    motion = post_moves((5.5, (0.6, 0.0, 0.9)))
+    rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=motion)
     assert rack.run_to_end(40.0).state == State.DONE
     assert rack.move.replans >= 1
     assert rack.read("servo.status").touches == 0
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
 
 
-@pytest.mark.slow
 def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)), (8.0, (0.5, 0.85, 0.95)))
     rack = WholeRack(arm="puma560_crossing", actions=[ABOVE_BLOCK], motion=motion)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
+from rack.levels.algebra import Array
 from rack.levels.elemental_move import ElementalMoveExecutor
 from rack.levels.messages import Error, MovePlan, PrimitiveStatus, SegmentKind, TaskCommand, Verb
 from rack.levels.operator import ABOVE_LOST, BELOW_LOST
@@ -28,11 +28,8 @@ class Bench(Lockstep):
         places = {"above": "task", "below": "primitive"}
         board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, **places, params=params)
         robot, scene = config("puma560")
-        outside = {
-            "task.command": TaskCommand,
-            "primitive.status": PrimitiveStatus,
-            "elemental_move.plan": MovePlan,
-        }
+        outside = {"task.command": TaskCommand, "primitive.status": PrimitiveStatus}
+        outside["elemental_move.plan"] = MovePlan
         super().__init__([board], robot, scene, outside=outside)
         self.home = np.array(robot.home)
         self.below = self.message("primitive.status")
@@ -41,8 +38,7 @@ class Bench(Lockstep):
         self.ends = {0: self.home}
 
     def cycle(self, cycles: int = 1, **below: object) -> None:
-        """Show the primitive level's status with the fields `below` changed, and run some
-        cycles."""
+        """Show the primitive level's status with fields changed, and run some cycles."""
         for name, value in below.items():
             setattr(self.below, name, value)
         self.write("primitive.status", self.below)
@@ -57,13 +53,7 @@ class Bench(Lockstep):
         command.count, command.id = len(verbs), first + len(verbs) - 1
         self.write("task.command", command)
 
-    def plan(
-        self,
-        move: int,
-        start: NDArray[np.float64] | None = None,
-        replan: int = 0,
-        error: Error = Error.NONE,
-    ) -> None:
+    def plan(self, move: int, start: Array | None = None, replan: int = 0, error: int = 0) -> None:
         """Publish a path for a move, from `start` or the end of the path before, or a refusal."""
         plan = self.message("elemental_move.plan")
         plan.move, plan.replan, plan.kind, plan.error = move, replan, SegmentKind.PATH, error
@@ -123,29 +113,23 @@ def test_window_stays_full_until_the_program_is_done() -> None:
     assert bench.segments() == []
 
 
+CLOSED, MISSED = "the gripper has closed to", "it holds nothing"
+LOST, STRAYS = "of its way: the object is lost", "joint 2 strays"
+
+
 @pytest.mark.parametrize(
     ("below", "error", "reason"),
     [
+        ({"done": 3, "opening": 0.0005}, Error.GRASP_MISSED, f"{CLOSED} 1.2% of its way: {MISSED}"),
+        ({"done": 3, "opening": 0.022, "held": BLOCK}, Error.OBJECT_LOST, f"{CLOSED} 0.0% {LOST}"),
         (
-            {"done": 3, "opening": 0.0005},
-            Error.GRASP_MISSED,
-            "the gripper has closed to 1.2% of its way: it holds nothing",
-        ),
-        (
-            {"done": 3, "opening": 0.022, "held": BLOCK},
-            Error.OBJECT_LOST,
-            "the gripper has closed to 0.0% of its way: the object is lost",
-        ),
-        (
-            {"state": State.ERROR, "error": Error.FOLLOWING, "reason": "joint 2 strays"},
+            {"state": State.ERROR, "error": Error.FOLLOWING, "reason": STRAYS},
             Error.FOLLOWING,
-            "joint 2 strays",
+            STRAYS,
         ),
     ],
 )
-def test_failure_stops_everything_with_its_reason(
-    below: dict[str, Any], error: Error, reason: str
-) -> None:
+def test_failure_stops_all_with_a_reason(below: dict[str, Any], error: Error, reason: str) -> None:
     bench = planned_bench()
     bench.cycle(2, done=2)
     bench.cycle(2, **below)
@@ -187,12 +171,9 @@ def test_another_path_replaces_the_blocked_one_and_withdraws_later_segments() ->
 
 
 def test_a_path_that_stays_blocked_is_an_error_that_names_the_obstacle() -> None:
-    # As where the guard sees a collision that the planner does not: every path is free, and none
-    # can be followed.
-    bench, why = (
-        planned_bench(replans=3),
-        "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm",
-    )
+    # As where the guard sees a collision that the planner does not.
+    bench = planned_bench(replans=3)
+    why = "blocked: 'pad_left' and 'block1' are -7.1 mm apart; valid: 0.0 mm"
     for _ in range(3):
         serial = bench.segments()[0][0]
         bench.cycle(2, current=serial, blocked=1, state=State.HOLDING, reason=why)
@@ -209,8 +190,7 @@ def test_a_deadline_is_handed_down_minus_the_time_of_the_answer() -> None:
     bench.order([Verb.MOVE_JOINTS], by=20.0)
     bench.plan(1)
     bench.cycle(2)
-    # The report of the primitive level waits a cycle to be read and this level's a cycle to be
-    # seen.
+    # The report of the level below waits a cycle to be read, this level's a cycle to be seen.
     assert 18.0 < bench.command.segments[0]["by"] <= 20.0 - 2 * 0.25
 
 
@@ -243,9 +223,7 @@ def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     ("mailbox", "reason", "hold"),
     [("task.command", ABOVE_LOST, 1), ("primitive.status", BELOW_LOST, 0)],
 )
-def test_the_loss_of_a_neighbour_is_reported_until_it_ends(
-    mailbox: str, reason: str, hold: int
-) -> None:
+def test_the_loss_of_a_neighbour_is_reported(mailbox: str, reason: str, hold: int) -> None:
     bench = planned_bench()
     bench.boxes[mailbox].lost = True
     bench.cycle(2)

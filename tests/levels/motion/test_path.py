@@ -23,9 +23,8 @@ def test_derivatives_agree_with_finite_differences() -> None:
     ahead, ahead_dq, _ = evaluate_points(path, s + step)
     behind, behind_dq, _ = evaluate_points(path, s - step)
     assert np.abs((ahead - behind) / (2 * step) - dq).max() < 1e-8
-    assert (
-        np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4
-    )  # q'' has kinks where a blend ends
+    # q'' has kinks where a blend ends.
+    assert np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4
 
 
 def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
@@ -55,10 +54,9 @@ def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
     assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
     straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
     assert straight.stops == []
-    path = BlendedPath(
-        [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0]
-    )
-    assert path.waypoints == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    path = BlendedPath(corner[[0, 0, 1, 1, 2]], [0.0, 0.3, 0.2, 0.4, 0.0])
+    assert path.waypoints == pytest.approx(corner)
     assert path.blend == pytest.approx([0.0, 0.2, 0.0])
     nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])
     assert nowhere.length == 0.0

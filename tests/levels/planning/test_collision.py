@@ -13,11 +13,10 @@ from rack.levels.compiled import preload
 from rack.levels.planning import collision
 from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, find_first_blocked
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
+from rack.levels.planning.pose import build_pointing_quaternion, make_pose
 from rack.levels.robot.cell import Cell, build_cell
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 
-DOWN = (0.0, 0.0, -1.0)
 BLOCK1, BLOCK2, PEG = 0, 1, 2
 
 
@@ -26,52 +25,40 @@ def puma() -> Cell:
     return cell("puma560")
 
 
-@pytest.fixture(scope="module")
-def ik(puma: Cell) -> InverseKinematics:
-    return InverseKinematics(puma, 1)
+class Checker(CollisionChecker):
+    """The checker of the PUMA's cell, which also finds configurations with the tool at a place."""
+
+    def at(self, x: float, y: float, z: float) -> np.ndarray:
+        """Return a configuration whose tool points straight down at a place."""
+        pose = make_pose((x, y, z), build_pointing_quaternion((0.0, 0.0, -1.0)))
+        return InverseKinematics(self.cell, 1).find_solutions(pose, self.cell.home)[0]
 
 
 @pytest.fixture
-def checker(puma: Cell) -> CollisionChecker:
-    return CollisionChecker(puma, config("puma560")[1])
+def checker(puma: Cell) -> Checker:
+    return Checker(puma, config("puma560")[1])
 
 
-def tool_down(x: float, y: float, z: float) -> Pose:
-    return make_pose((x, y, z), build_pointing_quaternion(DOWN))
-
-
-def at(ik: InverseKinematics, puma: Cell, x: float, y: float, z: float) -> np.ndarray:
-    found = ik.find_solutions(tool_down(x, y, z), puma.home)
-    assert found
-    return found[0]
-
-
-def test_arm_in_the_wall_is_not_free_and_the_wall_is_named(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
+def test_arm_in_the_wall_is_not_free_and_the_wall_is_named(puma: Cell, checker: Checker) -> None:
     assert checker.is_free(puma.home)
     assert checker.describe_collision(puma.home) == ""
     assert checker.find_clearance(puma.home) == checker.clearance
-    q = at(ik, puma, 0.5, 0.0, 0.7)
+    q = checker.at(0.5, 0.0, 0.7)
     assert not checker.is_free(q)
     assert "'wall'" in checker.describe_collision(q)
     assert checker.find_clearance(q) < 0
 
 
-def test_clearance_decides_near_the_table_and_may_be_lowered(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
+def test_clearance_decides_near_the_table_and_may_be_lowered(checker: Checker) -> None:
     # The fingers end 20 mm below the tool and the table is 0.45 m high: 10 mm are left.
-    q = at(ik, puma, 0.45, -0.4, 0.48)
+    q = checker.at(0.45, -0.4, 0.48)
     assert not checker.is_free(q)
     assert checker.is_free(q, clearance=0.009)
     assert not checker.is_free(q, clearance=0.011)
     assert checker.find_clearance(q) == pytest.approx(0.010, abs=1e-4)
 
 
-def test_pads_of_a_gripper_may_touch_each_other_even_if_the_model_names_them_as_a_pair(
-    tmp_path: Path,
-) -> None:
+def test_pads_of_a_gripper_may_touch_even_if_the_model_pairs_them(tmp_path: Path) -> None:
     for file in ROBOTS.glob("puma560*.xml"):
         text = file.read_text()
         if file.name == "puma560.xml":
@@ -87,10 +74,8 @@ def test_pads_of_a_gripper_may_touch_each_other_even_if_the_model_names_them_as_
     assert checker.is_free(puma.home)
 
 
-def test_the_gripper_may_only_touch_the_intended_block(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
-    q = at(ik, puma, 0.5, 0.3, 0.475)
+def test_the_gripper_may_only_touch_the_intended_block(checker: Checker) -> None:
+    q = checker.at(0.5, 0.3, 0.475)
     assert not checker.is_free(q)
     checker.permit_contact(BLOCK1)
     assert checker.is_free(q)
@@ -100,15 +85,12 @@ def test_the_gripper_may_only_touch_the_intended_block(
     assert not checker.is_free(q)
     # Open fingers must not go through it.
     checker.permit_contact(BLOCK1)
-    assert "'block1'" in checker.describe_collision(at(ik, puma, 0.5, 0.3 + 0.02, 0.475))
+    assert "'block1'" in checker.describe_collision(checker.at(0.5, 0.3 + 0.02, 0.475))
 
 
-def test_held_block_is_carried_and_keeps_clear_of_the_wall(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
-    # The tool is as far from the wall as the palm needs, a block held 80 mm below it would stand in
-    # the wall's top.
-    q = at(ik, puma, 0.5, 0.0, 0.80)
+def test_held_block_is_carried_and_keeps_clear_of_the_wall(checker: Checker) -> None:
+    # The palm is clear of the wall; a block held 80 mm below the tool would stand in its top.
+    q = checker.at(0.5, 0.0, 0.80)
     assert checker.is_free(q)
     checker.hold_object(BLOCK1, (0.0, 0.0, 0.05))
     assert not checker.is_free(q)
@@ -117,21 +99,17 @@ def test_held_block_is_carried_and_keeps_clear_of_the_wall(
     assert checker.is_free(q)
 
 
-def test_a_held_block_may_touch_the_table_only_if_intended_and_not_sink_into_it(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
+def test_a_held_block_may_touch_the_table_only_if_intended(checker: Checker) -> None:
     checker.hold_object(BLOCK1)
-    on_table = at(ik, puma, 0.5, -0.2, 0.475)
+    on_table = checker.at(0.5, -0.2, 0.475)
     assert not checker.is_free(on_table)
     checker.permit_contact(BLOCK1)
     assert checker.is_free(on_table)
-    assert not checker.is_free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
+    assert not checker.is_free(checker.at(0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
 
 
-def test_objects_are_where_they_are_placed(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
-    q = at(ik, puma, 0.7, 0.2, 0.55)
+def test_objects_are_where_they_are_placed(checker: Checker) -> None:
+    q = checker.at(0.7, 0.2, 0.55)
     positions, quaternions = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     positions[:] = [[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]]
     checker.place_bodies(positions, quaternions)

@@ -20,10 +20,8 @@ DOWN = build_pointing_quaternion((0.0, 0.0, -1.0))
 def random_poses(name: str, count: int) -> list[Pose]:
     rng, (low, high) = np.random.default_rng(SEED), find_sampling_range(CELLS[name])
     margin = 2 * LIMIT_MARGIN_RAD
-    return [
-        SOLVERS[name].compute_tool_pose(rng.uniform(low + margin, high - margin))
-        for _ in range(count)
-    ]
+    joints = (rng.uniform(low + margin, high - margin) for _ in range(count))
+    return [SOLVERS[name].compute_tool_pose(q) for q in joints]
 
 
 @pytest.mark.slow
@@ -43,15 +41,14 @@ def test_every_pose_of_a_valid_configuration_is_reached_within_the_limits(name: 
 
 def test_solutions_are_distinct_and_the_quickest_to_reach_is_first() -> None:
     ik, home = SOLVERS["puma560"], CELLS["puma560"].home
-    found = ik.find_solutions(make_pose((0.5, -0.2, 0.7), DOWN), home)
+    pose = make_pose((0.5, -0.2, 0.7), DOWN)
+    found = ik.find_solutions(pose, home)
     assert len(found) >= 2
     times = [ik.compute_travel_time(home, q) for q in found]
     assert times == sorted(times)
     for k, q in enumerate(found):
         assert all(np.max(np.abs(q - other)) > 1e-2 for other in found[:k])
-    kept = ik.find_free_solutions(
-        make_pose((0.5, -0.2, 0.7), DOWN), home, lambda q: not np.allclose(q, found[0])
-    )
+    kept = ik.find_free_solutions(pose, home, lambda q: not np.allclose(q, found[0]))
     assert kept
     assert not any(np.allclose(q, found[0]) for q in kept)
 

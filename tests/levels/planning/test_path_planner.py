@@ -19,6 +19,8 @@ from tests.levels.arms import cell, config
 
 SEED = 3
 SCENE = config("puma560")[1]
+DOWN = build_pointing_quaternion((0, 0, -1))
+Sides = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -37,23 +39,16 @@ def planner(puma: Cell) -> PathPlanner:
 
 
 @pytest.fixture(scope="module")
-def sides(puma: Cell, checker: CollisionChecker) -> tuple[np.ndarray, np.ndarray]:
+def sides(puma: Cell, checker: CollisionChecker) -> Sides:
     """Configurations low on either side of the wall."""
     ik = InverseKinematics(puma, SEED)
-    left = ik.find_free_solutions(
-        make_pose((0.5, 0.3, 0.6), build_pointing_quaternion((0, 0, -1))),
-        puma.home,
-        checker.is_free,
-    )[0]
-    return left, ik.find_free_solutions(
-        make_pose((0.5, -0.2, 0.6), build_pointing_quaternion((0, 0, -1))), left, checker.is_free
-    )[0]
+    poses = (make_pose((0.5, y, 0.6), DOWN) for y in (0.3, -0.2))
+    left = ik.find_free_solutions(next(poses), puma.home, checker.is_free)[0]
+    return left, ik.find_free_solutions(next(poses), left, checker.is_free)[0]
 
 
 @pytest.fixture(scope="module")
-def around(
-    planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]
-) -> Path:
+def around(planner: PathPlanner, checker: CollisionChecker, sides: Sides) -> Path:
     path = planner.plan(*sides, checker.find_first_blocked)
     assert path is not None
     return path
@@ -61,56 +56,45 @@ def around(
 
 @pytest.mark.slow
 def test_path_around_the_wall_is_free_between_its_checks_too(
-    planner: PathPlanner,
-    checker: CollisionChecker,
-    around: Path,
-    sides: tuple[np.ndarray, np.ndarray],
+    planner: PathPlanner, checker: CollisionChecker, around: Path, sides: Sides
 ) -> None:
     assert np.array_equal(around.waypoints[0], sides[0])
     assert np.array_equal(around.end, sides[1])
     assert 3 <= len(around.waypoints) <= WAYPOINTS
     # Between two checks no point moves farther than half the clearance: half of that may be lost.
     least = 0.74 * SCENE.clearance
-    assert all(
-        checker.is_free(q, least)
-        for q in BlendedPath(*around).sample_points(0.13 * planner.step_rad)
-    )
+    points = BlendedPath(*around).sample_points(0.13 * planner.step_rad)
+    assert all(checker.is_free(q, least) for q in points)
 
 
 @pytest.mark.slow
 def test_equal_requests_get_equal_paths_whatever_was_planned_before(
-    puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
+    puma: Cell, checker: CollisionChecker, around: Path, sides: Sides
 ) -> None:
-    fresh = PathPlanner(puma, SCENE.clearance, SEED)
-    fresh.plan(sides[1], sides[0], checker.find_first_blocked)
-    again = fresh.plan(*sides, checker.find_first_blocked)
+    fresh, blocked = PathPlanner(puma, SCENE.clearance, SEED), checker.find_first_blocked
+    fresh.plan(sides[1], sides[0], blocked)
+    again = fresh.plan(*sides, blocked)
     assert again is not None
     assert np.array_equal(again.waypoints, around.waypoints)
     assert np.array_equal(again.blend, around.blend)
-    other = fresh.plan(*sides, checker.find_first_blocked, attempt=1)
+    other = fresh.plan(*sides, blocked, attempt=1)
     assert other is not None
     assert not np.array_equal(other.waypoints[1], around.waypoints[1])
-    hasty = fresh.plan(*sides, checker.find_first_blocked, searches=1)
+    hasty = fresh.plan(*sides, blocked, searches=1)
     assert hasty is not None
     assert fresh.compute_duration(hasty) >= fresh.compute_duration(around)
 
 
 def test_no_path_where_goal_or_start_is_blocked(
-    planner: PathPlanner,
-    checker: CollisionChecker,
-    puma: Cell,
-    sides: tuple[np.ndarray, np.ndarray],
+    planner: PathPlanner, checker: CollisionChecker, puma: Cell
 ) -> None:
-    in_the_wall = InverseKinematics(puma, SEED).find_solutions(
-        make_pose((0.5, 0.0, 0.65), build_pointing_quaternion((0, 0, -1))), puma.home
-    )[0]
+    pose = make_pose((0.5, 0.0, 0.65), DOWN)
+    in_the_wall = InverseKinematics(puma, SEED).find_solutions(pose, puma.home)[0]
     assert planner.plan(puma.home, in_the_wall, checker.find_first_blocked) is None
     assert planner.plan(in_the_wall, puma.home, checker.find_first_blocked) is None
 
 
-def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
-    planner: PathPlanner,
-) -> None:
+def test_blend_shrinks_to_a_stop_where_its_inside_is_blocked(planner: PathPlanner) -> None:
     corner = np.array([[0.0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0]])
 
     def on_the_polyline(configurations: np.ndarray) -> int:
@@ -124,7 +108,7 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
 
 
 def test_a_search_frees_its_memory(
-    planner: PathPlanner, sides: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    planner: PathPlanner, sides: Sides, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alive = []
 

@@ -1,4 +1,4 @@
-"""Payloads too heavy for grip or motors are refused before anything moves, with both numbers."""
+"""Payloads too heavy are refused before anything moves; planning keeps a margin around objects."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ import pytest
 
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
-from rack.levels.planning.motion_planner import MotionPlanner
-from rack.levels.planning.moves import Move, Situation
-from rack.levels.planning.payload import Payloads
-from rack.levels.planning.pose import Pose, make_pose
+from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.motion_planner import MAX_DEVIATION_M, MotionPlanner
+from rack.levels.planning.moves import Move
+from rack.levels.planning.payload import GAP_M, FixedJaw, Payloads, find_fixed_jaw
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.tables import SceneConfig
+from rack.levels.task.actions import TransferPlanner
 from rack.levels.task.grasps import find_grasps
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar
+from rack.levels.task.program import DOWN
+from rack.levels.task.rehearsal import Rehearsal
+from tests.levels.arms import CLOCK_NS, cell, config, find_situation, four_bar, pendulum
+from tests.levels.robot import grippers
 
 ROBOT, SCENE = config("puma560")
 BLOCK1, PEG = 0, 2
@@ -28,14 +34,9 @@ def weighing(kilograms: float) -> Cell:
     return made
 
 
-def situation_of(made: Cell) -> Situation:
-    data = made.build_start_data()
-    return Situation(data.xpos[made.bodies].copy(), data.xquat[made.bodies].copy())
-
-
 def grip_of(made: Cell, row: int) -> Pose:
     """Return the grip of the first grasp of an object."""
-    at = situation_of(made)
+    at = find_situation(made)
     return next(iter(find_grasps(made, at, row)))[0].inverse() @ at.object_pose(row)
 
 
@@ -43,12 +44,10 @@ def grip_of(made: Cell, row: int) -> Pose:
 def test_grip_is_weighed_against_friction_with_both_forces(turn: float) -> None:
     # 40 N at one finger are 20 N at each pad, whose friction is 1.2: 48 N.
     made = weighing(6.0)
-    turned = grip_of(made, BLOCK1) @ make_pose(
-        np.zeros(3), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
-    )
-    with pytest.raises(
-        Refused, match=r"payload 'block1' 6 kg needs 88\.3 N of grip; the gripper holds 48\.0 N"
-    ) as got:
+    yaw = make_pose(np.zeros(3), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)))
+    turned = grip_of(made, BLOCK1) @ yaw
+    why = r"payload 'block1' 6 kg needs 88\.3 N of grip; the gripper holds 48\.0 N"
+    with pytest.raises(Refused, match=why) as got:
         Payloads(made, SCENE.objects).check_grip(BLOCK1, turned)
     assert got.value.code == Error.OVERLOAD
     light = weighing(3.2)
@@ -67,8 +66,7 @@ def test_thin_object_is_gripped_by_the_spring_of_the_position_loop() -> None:
 
 
 def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
-    # The cranks, 50 mm, close on 50 mm near asin(0.5): 1 N m of each, 1 / (0.05 cos(pi/6)) N at its
-    # pad.
+    # The cranks, 50 mm, close on 50 mm near asin(0.5): of 1 N m each, 1 / (0.05 cos(pi/6)) N.
     made = build_cell(*four_bar(tmp_path), CLOCK_NS)
     made.model.body_subtreemass[made.bodies[BLOCK1]] = 6.0
     with pytest.raises(Refused) as refused:
@@ -79,20 +77,93 @@ def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
 
 def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
     made = weighing(40.0)
-    move = Move(
-        1,
-        0,
-        Verb.MOVE_JOINTS,
-        None,
-        make_pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)),
-        made.home + 0.3,
-        False,
-        0.0,
-    )
-    motion, empty = MotionPlanner(made, SCENE, 1990), situation_of(made)
+    pose = make_pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
+    move = Move(1, 0, Verb.MOVE_JOINTS, None, pose, made.home + 0.3, False, 0.0)
+    motion, empty = MotionPlanner(made, SCENE, 1990), find_situation(made)
     motion.plan(move, made.home, empty)
-    with pytest.raises(
-        Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries"
-    ) as got:
+    why = r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries"
+    with pytest.raises(Refused, match=why) as got:
         motion.plan(move, made.home, empty.with_object_held(BLOCK1, grip_of(made, BLOCK1)))
     assert got.value.code == Error.OVERLOAD
+
+
+STOP = '<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
+TOP_M = 0.7 + 0.03 + 0.01  # of the upper arm at home, and half of the post
+
+
+def hinged(folder: Path, apart: float) -> tuple[Cell, SceneConfig]:
+    """Return a two-joint arm whose carrier ends `apart`, m, above its first link at home."""
+    robot = pendulum(folder)
+    text = robot.model.read_text()
+    carrier = f'<body name="base">{STOP.format(z=TOP_M + apart)}<body name="upper"'
+    text = text.replace('<body name="upper"', carrier)
+    robot.model.write_text(text.replace("</worldbody>", "</body></worldbody>"))
+    return build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig()
+
+
+def test_links_keep_the_margin_only_in_planning(tmp_path: Path) -> None:
+    made, scene = hinged(tmp_path, 0.004)
+    lifted = np.array([-0.0032 / 0.2, 0.5])  # 0.8 mm are left
+    assert CollisionChecker(made, scene).is_free(lifted)
+    planned = CollisionChecker(made, scene, MAX_DEVIATION_M)
+    assert planned.is_free(made.home)
+    assert not planned.is_free(lifted)
+    assert 0.0 < planned.find_clearance(lifted) < MAX_DEVIATION_M
+    assert planned.is_free(lifted, planned.find_clearance(lifted))
+
+
+def lowest_grasp(folder: Path, length: float) -> float:
+    """Return how far above its origin block1 is taken with fingers of `length`, m."""
+    robot, scene = grippers.rotary(folder)
+    model = folder / "puma560.xml"
+    pad = f'size=".012 .006 {length / 2}" pos="0 0 {0.01 + length / 2}"'
+    model.write_text(model.read_text().replace('size=".012 .006 .04" pos="0 0 .05"', pad))
+    made = build_cell(robot, scene, CLOCK_NS)
+    situation = find_situation(made)
+    rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
+    takes = next(TransferPlanner(rehearsal, 0, 0.1).find_pick_spots())
+    return float(takes[0].tool.position[2] - situation.positions[0, 2])
+
+
+@pytest.mark.parametrize(("length", "height"), [(0.08, 0.0), (0.098, 0.01)])
+def test_a_grasp_has_room_for_closing_fingers(tmp_path: Path, length: float, height: float) -> None:
+    assert lowest_grasp(tmp_path, length) == pytest.approx(height)
+
+
+JAW_M = 0.025
+"""Distance from the tool of `grippers.one_finger` to its jaw, on the negative y side."""
+
+
+def jaw_of(made: Cell) -> FixedJaw | None:
+    return find_fixed_jaw(made, Payloads(made, ("block1", "block2", "peg")))
+
+
+def one_finger(folder: Path) -> Cell:
+    arm = grippers.one_finger(folder)
+    return build_cell(*arm, CLOCK_NS)
+
+
+@pytest.mark.parametrize("half", [0.01, 0.02, 0.03])
+def test_the_jaw_is_placed_next_to_an_object_of_any_width(tmp_path: Path, half: float) -> None:
+    made = one_finger(tmp_path)
+    geom = made.model.body_geomadr[made.bodies[0]]
+    made.model.geom_size[geom] = half
+    jaw = jaw_of(made)
+    assert jaw is not None
+    seen = Pose(np.array([0.5, 0.2, 0.475]), np.array([1.0, 0.0, 0.0, 0.0]))
+    tool = Pose(seen.position, build_pointing_quaternion(DOWN))
+    moved = tool.inverse() @ jaw.move_beside(tool, 0, seen)
+    assert moved.position == pytest.approx([0.0, JAW_M - half - GAP_M, 0.0], abs=2e-4)
+
+
+def test_an_object_that_the_jaw_cannot_meet_does_not_move_the_tool(tmp_path: Path) -> None:
+    jaw = jaw_of(one_finger(tmp_path))
+    assert jaw is not None
+    tool = Pose(np.array([0.5, 0.2, 0.475]), build_pointing_quaternion(DOWN))
+    below = tool.raise_by(-0.2)
+    assert jaw.move_beside(tool, 0, below) is tool
+
+
+def test_fingers_that_both_move_have_no_fixed_jaw(tmp_path: Path) -> None:
+    assert jaw_of(cell("puma560")) is None
+    assert jaw_of(build_cell(*grippers.rotary(tmp_path), CLOCK_NS)) is None

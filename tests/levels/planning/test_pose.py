@@ -40,14 +40,11 @@ def test_interpolation_between_poses_is_straight_with_a_constant_turn_rate() -> 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.3, -2.0, 0.4)])
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 def test_pointing_turns_the_z_axis_to_the_direction(direction: tuple, yaw: float) -> None:
-    assert rotated([0, 0, 1], build_pointing_quaternion(direction, yaw)) == pytest.approx(
-        direction / np.linalg.norm(direction)
-    )
+    pointed = rotated([0, 0, 1], build_pointing_quaternion(direction, yaw))
+    assert pointed == pytest.approx(direction / np.linalg.norm(direction))
 
 
 def test_yaw_about_a_direction_turns_the_tool_about_its_own_z_axis() -> None:
-    still, turned = (
-        make_pose((0, 0, 0), build_pointing_quaternion((0, 1, 1))),
-        make_pose((0, 0, 0), build_pointing_quaternion((0, 1, 1), 0.7)),
-    )
+    quaternions = (build_pointing_quaternion((0, 1, 1), yaw) for yaw in (0.0, 0.7))
+    still, turned = (make_pose((0, 0, 0), quaternion) for quaternion in quaternions)
     assert still.compute_angle(turned) == pytest.approx(0.7)

@@ -24,8 +24,7 @@ BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
 
 
 class PrimitiveRack(Lockstep):
-    """The primitive level above the real servo and the simulated cell; `seen` and `set_points` are
-    its messages."""
+    """The primitive level above servo and simulated cell; `seen`, `set_points`: its messages."""
 
     def __init__(
         self,
@@ -34,19 +33,11 @@ class PrimitiveRack(Lockstep):
         params: Mapping[str, Any] | None = None,
     ) -> None:
         robot, scene = config(name)
-        places = {"above": "em", "below": "servo"}
+        places: Any = {"above": "em", "below": "servo", "params": params or {}}
         boards = [
             BoardSpec("servo", 1, ServoExecutor, ServoPlanner, 8, above="primitive"),
             BoardSpec("world", 8, WorldModel),
-            BoardSpec(
-                "primitive",
-                8,
-                PrimitiveExecutor,
-                PrimitivePlanner,
-                2,
-                **places,
-                params=params or {},
-            ),
+            BoardSpec("primitive", 8, PrimitiveExecutor, PrimitivePlanner, 2, **places),
         ]
         scene = scene.model_copy(update={"motion": tuple(motion)})
         super().__init__(boards, robot, scene, outside={"em.command": MoveCommand})
@@ -91,9 +82,7 @@ class PrimitiveRack(Lockstep):
         return self.status
 
 
-def path(
-    serial: int, waypoints: ArrayLike, blend: ArrayLike | None = None, **fields: Any
-) -> Segment:
+def path(serial: int, waypoints: ArrayLike, blend: Any = None, **fields: Any) -> Segment:
     """Return a PATH segment. Without `blend` the arm stops at every corner."""
     points = np.array(waypoints)
     blends = np.zeros(len(points)) if blend is None else blend
@@ -108,13 +97,8 @@ def two_paths(rack: PrimitiveRack) -> tuple[Segment, Segment]:
 
 
 def gripper(serial: int, opening: float, held: int = -1, force: float = 30.0) -> Segment:
-    return {
-        "id": serial,
-        "kind": SegmentKind.GRIPPER,
-        "object": held,
-        "opening": opening,
-        "force": force,
-    }
+    segment = {"id": serial, "kind": SegmentKind.GRIPPER, "object": held}
+    return segment | {"opening": opening, "force": force}
 
 
 def _fields(record: np.ndarray) -> dict[str, Any]:

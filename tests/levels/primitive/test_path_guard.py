@@ -22,17 +22,15 @@ from tests.levels.primitive.rack import PrimitiveRack, path
 CROSSING = "puma560_crossing"
 POST = "post"
 NEAR = np.array([-0.9, 1.2, -3.1, 0.0, -1.24, 0.0])
-"""The arm reaches out next to the wall; turning about its base from here it sweeps over the
-table."""
+"""The arm reaches out next to the wall; turning about its base it sweeps over the table."""
 SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
-    """Return a motion of the post: it waits, enters the path of the arm at `at`, and may leave."""
-    beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
-    moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + (
-        [(leaves_at, beside, 0.25)] if leaves_at else []
-    )
+def crossing(leaves_at: float | None = None) -> list[MotionConfig]:
+    """Return a motion of the post: it waits, enters the path of the arm at 1.4 s, and may leave."""
+    beside, inside = (0.85, 0.0, 0.8), (0.55, 0.0, 0.8)
+    moves = [(0.0, beside, 5.0), (1.4, inside, 0.25)]
+    moves += [(leaves_at, beside, 0.25)] if leaves_at else []
     return [MotionConfig(body=POST, at=start, to=to, speed=speed) for start, to, speed in moves]
 
 
@@ -42,7 +40,7 @@ def sweep(rack: PrimitiveRack) -> None:
 
 @pytest.mark.slow
 def test_arm_rests_before_an_obstacle_that_crosses_touches_it() -> None:
-    rack = PrimitiveRack(CROSSING, motion=crossing(1.4))
+    rack = PrimitiveRack(CROSSING, motion=crossing())
     sweep(rack)
     rack.run(3.2)
     assert rack.status.blocked
@@ -60,7 +58,7 @@ def test_arm_rests_before_an_obstacle_that_crosses_touches_it() -> None:
 
 @pytest.mark.slow
 def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
-    rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
+    rack = PrimitiveRack(CROSSING, motion=crossing(leaves_at=4.0))
     sweep(rack)
     rack.run(3.0)
     assert rack.status.blocked
@@ -102,12 +100,10 @@ class Watched:
     def watch(self) -> None:
         self.guard.watch_path(self.segment, self.path, 0.04, self.world)
 
-    def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
-        """Return True if the path stays clear for `cycles` in which nothing moves."""
-        answers = [
-            self.guard.is_clear(self.path, self.trajectory, time_s, self.world)
-            for _ in range(cycles)
-        ]
+    def clear(self) -> bool:
+        """Return True if the path stays clear for 60 cycles in which nothing moves."""
+        state = self.path, self.trajectory, 0.0, self.world
+        answers = [self.guard.is_clear(*state) for _ in range(60)]
         return all(answers)
 
     def tool_at(self, q: np.ndarray) -> np.ndarray:
@@ -143,9 +139,8 @@ def test_work_of_the_guard_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     watched.watch()
     checks = []
     free = watched.guard._checker.is_free
-    monkeypatch.setattr(
-        watched.guard._checker, "is_free", lambda *args: checks.append(1) or free(*args)
-    )
+    checker = watched.guard._checker
+    monkeypatch.setattr(checker, "is_free", lambda *args: checks.append(1) or free(*args))
     counts = [0]
     for _ in range(40):
         watched.guard.is_clear(watched.path, watched.trajectory, 0.0, watched.world)

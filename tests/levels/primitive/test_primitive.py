@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
+from rack.levels.level import Demand
 from rack.levels.messages import Error
+from rack.levels.motion.path import BlendedPath
+from rack.levels.primitive.path_motion import PathMotion
+from rack.levels.robot.limits import Limits
 from tests.levels.arms import cell
+from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive.rack import BEND, TURN, PrimitiveRack, gripper, path, two_paths
+
+FIELDS = ("position", "velocity", "acceleration")
 
 
 def positions(rack: PrimitiveRack) -> np.ndarray:
@@ -17,11 +24,8 @@ def positions(rack: PrimitiveRack) -> np.ndarray:
 
 def first(rack: PrimitiveRack, **wanted: int) -> int:
     """Return the index of the first status with the given fields."""
-    return next(
-        k
-        for k, s in enumerate(rack.seen)
-        if all(s[name] == value for name, value in wanted.items())
-    )
+    shown = [all(s[name] == value for name, value in wanted.items()) for s in rack.seen]
+    return shown.index(True)
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +37,10 @@ def finished() -> PrimitiveRack:
     return rack
 
 
-def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
-    finished: PrimitiveRack,
-) -> None:
+def test_set_points_keep_limits_and_agree_with_derivatives(finished: PrimitiveRack) -> None:
     limits = cell("puma560").limits
     made = [p for p in finished.set_points if p["due"]]
-    q, qd, qdd = (
-        np.array([p[name] for p in made]) for name in ("position", "velocity", "acceleration")
-    )
+    q, qd, qdd = (np.array([p[name] for p in made]) for name in FIELDS)
     assert (np.abs(qd) <= limits.velocity * (1 + 1e-6)).all()
     assert (np.abs(qdd) <= limits.acceleration * (1 + 1e-6)).all()
     assert np.abs(qdd).max(axis=0) == pytest.approx(limits.acceleration, rel=1.0)
@@ -54,18 +54,14 @@ def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
     assert finished.servo.clipped == finished.servo.touches == 0
 
 
-def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(
-    finished: PrimitiveRack,
-) -> None:
+def test_next_path_is_planned_while_the_arm_moves(finished: PrimitiveRack) -> None:
     begun = first(finished, current=2)
     assert not finished.seen[begun]["resting"]
     assert finished.seen[begun]["done"] == 1
     assert finished.seen[first(finished, current=1, resting=0) + 4]["wants"] == 0
 
 
-def test_every_status_reports_progress_and_when_the_segment_will_be_done(
-    finished: PrimitiveRack,
-) -> None:
+def test_every_status_reports_progress_and_the_end(finished: PrimitiveRack) -> None:
     under_way = [s for s in finished.seen if s["current"] == 2]
     progress = [float(s["progress"]) for s in under_way]
     assert all(s["echo"] == 2 and s["state"] == State.EXECUTING for s in under_way)
@@ -115,9 +111,7 @@ def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves()
         (0.0, {"by": np.nan}, "not finite"),
     ],
 )
-def test_an_impossible_segment_is_an_error_and_the_next_command_is_carried_out(
-    offset: float, fields: dict, said: str
-) -> None:
+def test_an_impossible_segment_is_an_error(offset: float, fields: dict, said: str) -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home + offset, rack.home + TURN + offset]) | fields)
     status = rack.run_until_error()
@@ -136,3 +130,123 @@ def test_an_arm_without_gripper_or_scene_follows_a_path_and_refuses_a_grasp() ->
     assert np.abs(rack.servo.position - corner + 0.3).max() < 1e-3
     rack.command(gripper(2, opening=0.0))
     assert rack.run_until_error().reason == "segment 2: the arm has no gripper; valid: paths"
+
+
+def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
+    rack = PrimitiveRack(params={"following": 1e-6})
+    rack.command(path(1, [rack.home, rack.home + TURN]))
+    status = rack.run_until_error()
+    assert status.error == Error.FOLLOWING
+    assert "from its set point" in status.reason
+    rack.run(1.0)
+    assert rack.status.resting
+    assert rack.status.done == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("died_at_s", "away_s"), [(0.05, 0.25), (1.2, 0.25)])
+def test_a_restarted_executor_finishes_the_present_segment(died_at_s: float, away_s: float) -> None:
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    rack.run(died_at_s)
+    rack.tasks["primitive"].due = -1
+    rack.run(away_s)
+    rack.restart("primitive")
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+    assert rack.servo.touches == 0
+
+
+@pytest.mark.parametrize("died_at_s", [0.1, 1.0])
+def test_a_restarted_executor_keeps_its_grip(died_at_s: float) -> None:
+    rack = PrimitiveRack()
+    rack.command(gripper(1, opening=0.0, held=0, force=17.0))
+    rack.run(died_at_s)
+    rack.tasks["primitive"].due = -1
+    rack.run(0.02)
+    rack.restart("primitive")
+    rack.run(1.0)
+    assert (rack.status.done, rack.status.held) == (1, 0)
+    assert (rack.set_points[-1]["force"], rack.set_points[-1]["opening"]) == (17.0, 0.0)
+
+
+def seconds(time_s: float) -> int:
+    """Return a time in ticks."""
+    return round(time_s * 1e9 / CLOCK_NS)
+
+
+@pytest.mark.slow
+def test_arm_rests_on_its_path_while_the_board_above_is_lost() -> None:
+    rack = PrimitiveRack(params={"settling": 0.5, "silent": 0.5})
+    rack.command(*two_paths(rack))
+    rack.run(0.4)
+    rack.boxes["em.command"].lost = True
+    rack.run(0.5)
+    assert rack.status.resting
+    held_at = rack.status.progress
+    assert 0.0 < held_at < 1.0
+    rack.run(1.0)
+    assert (rack.status.progress, rack.status.error) == (held_at, 0)
+    rack.boxes["em.command"].lost = False
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
+def test_a_stopped_servo_is_waited_for_without_a_time_limit(demand: Demand) -> None:
+    # The stop outlasts every time limit; brakes take the arm some way off its path.
+    rack = PrimitiveRack(params={"silent": 0.5, "settling": 0.5, "straying": 0.02, "astray": 0.05})
+    rack.command(*two_paths(rack))
+    rack.run(0.4)
+    rack.stop(demand, seconds(1.2))
+    rack.run(1.1)
+    assert (rack.status.state, rack.status.error) == (State.HOLDING, 0)
+    assert rack.status.reason.startswith("waiting for servo: ")
+    assert rack.set_points[-1]["due"] == 0
+    assert rack.run_until_done(2)
+    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
+    assert {int(seen["error"]) for seen in rack.seen} == {0}
+
+
+@pytest.mark.slow
+def test_set_points_never_jump_however_often_boards_are_lost() -> None:
+    chance = np.random.default_rng(1)
+    rack = PrimitiveRack()
+    rack.command(*two_paths(rack))
+    for _ in range(6):
+        name = chance.choice(["primitive", "primitive", "primitive.planner", "servo", "world"])
+        at = int(chance.integers(seconds(2.5)))
+        rack.after(at, lambda name=name: rack.lose(name, int(chance.integers(1, 100))))
+    assert rack.run_until_done(2)
+    last = None
+    for new in rack.set_points:
+        assert all(np.isfinite(new[field]).all() for field in FIELDS)
+        if last is not None and last["due"] and new["due"]:
+            most = (new["due"] - last["due"]) * CLOCK_NS * 1e-9 * rack.fastest
+            assert (np.abs(new["position"] - last["position"]) <= 1.01 * most).all()
+        last = new
+    assert (rack.servo.clipped, rack.servo.touches) == (0, 0)
+
+
+@pytest.mark.slow
+def test_a_motion_that_resumes_at_the_end_of_its_path_is_finished() -> None:
+    for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
+        line = BlendedPath([[0.0], [length]], [0.0, 0.0])
+        motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
+        motion.reset_to_nearest(np.array([length]), progress=1.0)
+        assert motion.is_finished
+
+
+def test_a_silent_servo_is_an_error_until_a_status_arrives() -> None:
+    rack = PrimitiveRack(params={"silent": 0.5})
+    rack.command(*two_paths(rack))
+    rack.run(0.3)
+    servo = rack.tasks["servo"]
+    servo.due = -1
+    rack.run(0.8)
+    assert rack.status.error == Error.BELOW
+    assert rack.set_points[-1]["due"] == 0
+    servo.due = rack.tick
+    assert rack.run_until_done(2)
+    assert rack.status.error == 0

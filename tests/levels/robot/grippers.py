@@ -61,23 +61,22 @@ def sides(finger: str, tip: str = "", armature: str = 'armature=".1"') -> str:
     return "".join(made)
 
 
-def hand(  # a part of the model each
-    folder: Path,
-    fingers: str,
-    gripper: dict[str, Any],
-    equality: str = MIMIC,
-    actuator: str = "",
-    tendon: str = "",
-    tcp: float = 0.0,
+def hand(
+    folder: Path, fingers: str, gripper: dict[str, Any], equality: str = MIMIC, **parts: Any
 ) -> tuple[RobotConfig, SceneConfig]:
     """Write the PUMA with a gripper of its own to `folder`; return its robot and scene."""
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
-    text = before + PALM.format(fingers=fingers, tcp=tcp) + rest.split("</body>", 3)[3]
+    text = (
+        before
+        + PALM.format(fingers=fingers, tcp=parts.get("tcp", 0.0))
+        + rest.split("</body>", 3)[3]
+    )
     if "finger_right" not in fingers:
         text = text.replace('<exclude body1="finger_left" body2="finger_right"/>', "")
     start, end = text.index("<equality>"), text.index("</equality>")
     text = text[:start] + "<equality>" + equality + text[end:]
-    text = text.replace("</actuator>", f"{actuator}</actuator>{tendon}")
+    more = f"{parts.get('actuator', '')}</actuator>{parts.get('tendon', '')}"
+    text = text.replace("</actuator>", more)
     (folder / "puma560.xml").write_text(text)
     cell_file = folder / "puma560_cell.xml"
     cell_file.write_text((ROBOTS / "puma560_cell.xml").read_text())
@@ -89,7 +88,7 @@ def hand(  # a part of the model each
 def independent(folder: Path, **follow: Any) -> tuple[RobotConfig, SceneConfig]:
     """Two fingers, each with its own motor."""
     motor = '<position name="grip_right" joint="finger_right" kp="1000"/>'
-    return hand(folder, sides(SLIDE), {**SLIDING, **follow}, "", motor)
+    return hand(folder, sides(SLIDE), {**SLIDING, **follow}, "", actuator=motor)
 
 
 def rotary(folder: Path, armature: str = 'armature=".01"') -> tuple[RobotConfig, SceneConfig]:

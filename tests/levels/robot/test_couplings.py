@@ -22,6 +22,7 @@ PAIR = """<tendon><fixed name="pair"><joint joint="shoulder" coef="1"/>
 <joint joint="elbow" coef="-1"/></fixed>
 <fixed name="sum"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed>
 </tendon>"""
+ELBOW, TWO = 'joint1="elbow"', "couples aside, elbow,"
 BOTH = "couples shoulder, elbow,"
 
 
@@ -31,18 +32,12 @@ def equality(text: str) -> str:
 
 TIED = {
     "gear": (equality('<joint joint1="elbow" joint2="shoulder" polycoef="0 -1 0 0 0"/>'), BOTH),
-    "polynomial": (
-        equality('<joint joint1="elbow" joint2="shoulder" polycoef=".1 0 .5 0 0"/>'),
-        BOTH,
-    ),
+    "polynomial": (equality(f'<joint {ELBOW} joint2="shoulder" polycoef=".1 0 .5 0 0"/>'), BOTH),
     "locked": (equality('<joint name="lock" joint1="elbow"/>'), "'lock' couples elbow,"),
-    "follows another": (
-        equality('<joint joint1="elbow" joint2="aside"/>'),
-        "'elbow' and 'aside' couples aside, elbow,",
-    ),
+    "follows another": (equality(f'<joint {ELBOW} joint2="aside"/>'), "'elbow' and 'aside' " + TWO),
     "leads another": (
         equality('<joint joint1="aside" joint2="elbow"/><joint joint1="beside" joint2="aside"/>'),
-        "'aside' and 'elbow' couples aside, elbow,",
+        "'aside' and 'elbow' " + TWO,
     ),
     "tendons": (WINCH + equality('<tendon tendon1="cable" tendon2="winch"/>'), BOTH),
     "rope": (ROPE + equality('<tendon tendon1="rope"/>'), "<tendon> of 'rope' " + BOTH),
@@ -62,9 +57,7 @@ def write_coupled_arm(folder: Path, more: str, actuators: str = MOTORS) -> Robot
 
 
 @pytest.mark.parametrize(("more", "names"), TIED.values(), ids=TIED)
-def test_a_joint_of_the_arm_that_is_tied_is_refused_by_name(
-    tmp_path: Path, more: str, names: str
-) -> None:
+def test_a_tied_joint_of_the_arm_is_refused_by_name(tmp_path: Path, more: str, names: str) -> None:
     with pytest.raises(RobotError) as refused:
         build_cell(write_coupled_arm(tmp_path, more), SceneConfig(), CLOCK_NS)
     text = str(refused.value)
@@ -86,9 +79,7 @@ def test_an_equality_that_ties_no_joint_of_the_arm_is_permitted(tmp_path: Path, 
     build_cell(write_coupled_arm(tmp_path, more), SceneConfig(), CLOCK_NS)
 
 
-def test_joints_that_share_an_actuator_are_refused_unless_there_is_one_for_each(
-    tmp_path: Path,
-) -> None:
+def test_joints_that_share_an_actuator_are_refused(tmp_path: Path) -> None:
     one, other = '<motor name="winch" tendon="pair"/>', '<motor tendon="sum"/>'
     with pytest.raises(RobotError, match="joints elbow, shoulder share one actuator"):
         build_cell(write_coupled_arm(tmp_path, PAIR, one), SceneConfig(), CLOCK_NS)

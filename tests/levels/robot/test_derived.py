@@ -49,9 +49,8 @@ def test_joints_tool_and_home_come_from_actuators_sites_and_keyframe(tmp_path: P
 def test_a_model_without_actuators_must_have_its_joints_named(tmp_path: Path) -> None:
     text = MODEL.read_text()
     bare = text[: text.index("<actuator>")] + "</mujoco>"
-    with pytest.raises(
-        ConfigError, match=r"robot\.joints: name the joints, because none in the model"
-    ):
+    why = r"robot\.joints: name the joints, because none in the model"
+    with pytest.raises(ConfigError, match=why):
         config(tmp_path, model=bare)
 
 

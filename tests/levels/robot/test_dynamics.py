@@ -28,10 +28,8 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
     tree = ElementTree.parse(ROBOTS / "puma560.xml")
     root = tree.getroot()
     for name, parent in [(n, p) for p in root.iter() for n in list(p)]:
-        of_hand = name.get("name") in ("hand", "grip") or "hand" in (
-            name.get("body1"),
-            name.get("body2"),
-        )
+        bodies = name.get("body1"), name.get("body2")
+        of_hand = name.get("name") in ("hand", "grip") or "hand" in bodies
         fingers = "finger" in name.get("body1", "") + name.get("joint1", "")
         if of_hand or fingers:
             parent.remove(name)
@@ -39,9 +37,8 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
         joint.attrib.pop("damping", None)
     model = tmp_path_factory.mktemp("puma") / "bare.xml"
     tree.write(model)
-    robot = config("puma560")[0].model_copy(
-        update={"model": model, "tool": "wrist", "gripper": None}
-    )
+    changes = {"model": model, "tool": "wrist", "gripper": None}
+    robot = config("puma560")[0].model_copy(update=changes)
     return build_cell(robot, SceneConfig(), CLOCK_NS)
 
 
@@ -55,9 +52,7 @@ def test_puma_kinematics_match_the_robotics_toolbox(puma: Cell, pose: str) -> No
 
 
 @pytest.mark.parametrize("pose", PUMA)
-def test_puma_gravity_inertia_and_coriolis_torques_match_the_robotics_toolbox(
-    puma: Cell, pose: str
-) -> None:
+def test_puma_torques_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
     dynamics, published = Dynamics(puma), PUMA[pose]
     q, qd, qdd = (np.array(published[name]) for name in ("q", "qd", "qdd"))
     inertia, bias = (x.copy() for x in dynamics.terms(q, np.zeros(6)))
@@ -84,9 +79,8 @@ def test_torques_from_the_equation_of_motion_give_the_requested_acceleration(nam
     inertia, bias = dynamics.terms(made.home, qd)
     data = made.build_start_data()
     data.qvel[made.dof] = qd
-    data.ctrl[made.actuators] = (
-        inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
-    )
+    friction = made.model.dof_frictionloss[made.dof] * np.sign(qd)
+    data.ctrl[made.actuators] = inertia @ wanted + bias + friction
     if made.gripper is not None:  # fingers that do not fly apart
         data.qvel[made.gripper.dof] = 0.0
     mujoco.mj_forward(made.model, data)
@@ -113,11 +107,8 @@ def test_terms_do_not_depend_on_earlier_evaluations(puma: Cell) -> None:
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_terms_equal_a_full_forward_pass_bit_for_bit(name: str) -> None:
     made, rng = cell(name), np.random.default_rng(9)
-    dynamics, data, full = (
-        Dynamics(made),
-        made.build_start_data(),
-        np.zeros((made.model.nv, made.model.nv)),
-    )
+    dynamics, data = Dynamics(made), made.build_start_data()
+    full = np.zeros((made.model.nv, made.model.nv))
     made.model.opt.disableflags |= int(DISABLED_PARTS)
     for _ in range(5):
         data.qpos[made.qpos], data.qvel[made.dof] = rng.uniform(-1, 1, (2, len(made.qpos)))
@@ -137,14 +128,9 @@ def test_a_payload_acts_like_a_small_mass_fixed_to_the_tool(tmp_path: Path) -> N
     ball = f'<body pos="{x} {y} {z}">{inertia}</body>'
     loaded = tmp_path / "loaded.xml"
     loaded.write_text(text.replace('<site name="tcp"', ball + '<site name="tcp"'))
-    heavy = Dynamics(
-        build_cell(robot.model_copy(update={"model": loaded}), SceneConfig(), CLOCK_NS)
-    )
-    bare = Dynamics(
-        build_cell(
-            robot.model_copy(update={"model": ROBOTS / "puma560.xml"}), SceneConfig(), CLOCK_NS
-        )
-    )
+    models = loaded, ROBOTS / "puma560.xml"
+    robots = (robot.model_copy(update={"model": model}) for model in models)
+    heavy, bare = (Dynamics(build_cell(one, SceneConfig(), CLOCK_NS)) for one in robots)
     q, qd = np.random.default_rng(5).uniform(-1, 1, (2, 6))
     carried, welded = bare.terms(q, qd, Payload(mass, offset)), heavy.terms(q, qd)
     assert carried.inertia == pytest.approx(welded.inertia, abs=1e-7)

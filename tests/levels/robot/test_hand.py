@@ -72,10 +72,8 @@ def test_a_tension_turns_its_joint_and_no_other() -> None:
 
 def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
     made = build(config("utah_mit")[0])
-    geom = {
-        name: made.model.geom(name).id
-        for name in ("palm", "can", "stand", "index_pad", "thumb_pad")
-    }
+    names = ("palm", "can", "stand", "index_pad", "thumb_pad")
+    geom = {name: made.model.geom(name).id for name in names}
     assert not made.geoms.touch[geom["palm"], geom["can"]]
     assert not made.geoms.touch[geom["index_pad"], geom["thumb_pad"]]
     assert not made.geoms.touch[geom["can"], geom["stand"]]
@@ -97,12 +95,10 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         (TENDON, TENDON.replace("-.012", ".012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", "-.012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", ".010"), "on joint 'index0' are 0.01 to 0.012 m"),
-        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "on joint 'index0' are 0.012 to 0.012 m, and on others up to 0.01 m"),
+        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "on joint 'index0' are 0.012 to 0.012 m, and on others up to 0.01 m")
     ],
 )  # fmt: skip
-def test_a_tendon_that_is_not_part_of_a_pair_is_refused(
-    tmp_path: Path, old: str, new: str, why: str
-) -> None:
+def test_a_tendon_without_a_pair_is_refused(tmp_path: Path, old: str, new: str, why: str) -> None:
     with pytest.raises(RobotError, match=r"robot\.hand") as refused:
         build(replace_in_model(tmp_path, old, new))
     assert why in str(refused.value)
@@ -114,10 +110,7 @@ def test_a_tendon_that_is_not_part_of_a_pair_is_refused(
     [
         ({"least": 15.0}, "robot.hand.rest: 15 N must be above robot.hand.least, 15 N"),
         ({"rest": 100.0}, "robot.hand.rest: 100 N must be below the largest tension, 100 N"),
-        (
-            {"flexors": ("index0_flexor",)},
-            "robot.hand.flexors: has 1 values but needs 16, one per joint",
-        ),
+        ({"flexors": ("one",)}, "robot.hand.flexors: has 1 values but needs 16, one per joint"),
     ],
 )
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
@@ -127,7 +120,6 @@ def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], wh
 
 def test_a_hand_has_no_gripper_and_no_torque_limits() -> None:
     robot = config("utah_mit")[0]
-    with pytest.raises(
-        RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"
-    ):
+    why = r"robot\.torque: torques of a hand follow from its tendons"
+    with pytest.raises(RobotError, match=why):
         build(robot.model_copy(update={"torque": (1.0,) * 16}))

@@ -1,5 +1,4 @@
-"""Grippers whose joints follow one that is driven: geared, in closed loops, on springs and
-stops."""
+"""Grippers whose joints follow one that is driven: geared, in closed loops."""
 
 from __future__ import annotations
 
@@ -23,8 +22,7 @@ def build_linkage_cell(folder: Path, old: str = "", new: str = "") -> Cell:
 
 
 def settle_gripper(made: Cell, force: float) -> mujoco.MjData:
-    """Return the simulated cell after a second with `force` on the gripper, its arm held at
-    home."""
+    """Return the cell after a second with `force` on the gripper, its arm held at home."""
     assert made.gripper is not None
     data = made.build_start_data()
     data.ctrl[made.gripper.actuator] = force
@@ -35,8 +33,7 @@ def settle_gripper(made: Cell, force: float) -> mujoco.MjData:
 
 
 def compute_deviation(made: Cell, data: mujoco.MjData) -> float:
-    """Return how far the farthest joint of the gripper is from where the linkage puts it, in
-    rad."""
+    """Return how far the farthest joint is from where the linkage puts it, rad."""
     assert made.gripper is not None
     posed = np.array(data.qpos)
     made.gripper.linkage.set_opening(posed, float(data.qpos[made.gripper.linkage.driven]))
@@ -57,29 +54,23 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
     assert compute_deviation(made, settle_gripper(made, -1.0)) < 1e-3
 
 
+LOOP = '<connect name="loop_left"'
+OFF = r"robot\.gripper: equality 'loop_left' is off by \d"
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        (
-            '<connect name="loop_left"',
-            '<weld name="loop_left"',
-            r"robot\.gripper: equality 'loop_left' is off by \d",
-        ),
-        ('<connect name="loop_left"', "<weld", "equality <weld> of 'rod_left' and 'tip_left' is"),
-    ],
+    ("weld", "words"),
+    [('<weld name="loop_left"', OFF), ("<weld", "equality <weld> of 'rod_left' and 'tip_left' is")],
 )
-def test_a_linkage_that_cannot_move_is_refused_with_the_name_of_its_equality(
-    tmp_path: Path, old: str, new: str, words: str
-) -> None:
+def test_a_linkage_that_cannot_move_is_refused(tmp_path: Path, weld: str, words: str) -> None:
     with pytest.raises(RobotError, match=words):
-        build_linkage_cell(tmp_path, old, new)
+        build_linkage_cell(tmp_path, LOOP, weld)
 
 
-@pytest.mark.parametrize(
-    ("equality", "joint"), [("gear", "crank_right"), ("loop_right", "tip_right")]
-)
-def test_joint_that_nothing_determines_is_refused_by_name(
-    tmp_path: Path, equality: str, joint: str
-) -> None:
+FOLLOWERS = [("gear", "crank_right"), ("loop_right", "tip_right")]
+
+
+@pytest.mark.parametrize(("equality", "joint"), FOLLOWERS)
+def test_joint_that_follows_nothing_is_refused(tmp_path: Path, equality: str, joint: str) -> None:
     with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
         build_linkage_cell(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')

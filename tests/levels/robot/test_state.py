@@ -6,14 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.simulation import enable_sleep
-from rack.levels.messages import ArmState
-from rack.levels.robot.cell import compute_sizes
-from rack.levels.robot.engine import SLEEP
+from rack.levels.robot.engine import SLEEP, build_contact_views, mj_step
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
-from tests.levels.arms import CLOCK_NS, cell, config
+from tests.levels.arms import CLOCK_NS, cell, config, save_state
 
 PUSH = PushConfig(body="block1", at=0.5, seconds=0.1, force=(0.0, 2.0, 0.0))
 PUSHED_TICK = 200
@@ -31,12 +28,6 @@ def build_arm(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
     return kind(cell("puma560"), scene.model_copy(update={"push": (PUSH,)}), CLOCK_NS)
 
 
-def save_state(arm: SimulatedArm) -> Message:
-    message = ArmState.zeros(compute_sizes(arm.cell))
-    arm.save(message)
-    return message
-
-
 def read_state(arm: SimulatedArm) -> list[float]:
     found: list[float] = save_state(arm).state.tolist()
     return found
@@ -48,8 +39,7 @@ def list_asleep(arm: SimulatedArm) -> list[bool]:
 
 
 def read_places(arm: SimulatedArm) -> np.ndarray:
-    rows = arm.cell.object_qpos[:, None] + np.arange(3)
-    return np.array(arm._data.qpos[rows])
+    return np.array(arm._data.qpos[arm.cell.object_qpos[:, None] + np.arange(3)])
 
 
 def test_objects_sleep_until_one_is_pushed_and_end_where_they_would_without_sleep() -> None:
@@ -69,9 +59,7 @@ def test_objects_sleep_until_one_is_pushed_and_end_where_they_would_without_slee
 
 
 @pytest.mark.parametrize("tick", [FALLING_ASLEEP_TICK, 100, PUSHED_TICK + 5, END_TICK - 60])
-def test_a_restored_cell_continues_bit_for_bit_asleep_or_awake(
-    tick: int,
-) -> None:
+def test_a_restored_cell_continues_bit_for_bit_asleep_or_awake(tick: int) -> None:
     arm, again = build_arm(), build_arm()
     arm.step(tick)
     again.step(PUSHED_TICK + 3)  # where others are awake
@@ -86,9 +74,8 @@ def test_nothing_sleeps_where_an_obstacle_moves() -> None:
     made = cell("puma560_crossing")
     _, scene = config("puma560_crossing")
     (name, *_) = scene.obstacles
-    moving = SceneConfig(
-        obstacles=(name,), motion=(MotionConfig(body=name, at=0.0, to=(0.0, 0.0, 0.0), speed=0.1),)
-    )
+    motion = MotionConfig(body=name, at=0.0, to=(0.0, 0.0, 0.0), speed=0.1)
+    moving = SceneConfig(obstacles=(name,), motion=(motion,))
     assert not enable_sleep(made.model, moving).opt.enableflags & SLEEP
     assert enable_sleep(made.model, SceneConfig()).opt.enableflags & SLEEP
     assert not made.model.opt.enableflags & SLEEP
@@ -110,9 +97,7 @@ def test_nothing_sleeps_in_a_model_for_which_mujoco_would_end_the_process() -> N
     ("timestep", "gravity", "sleeps"),
     [(5e-4, 9.81, True), (2e-5, 9.81, False), (5e-4, 0.5, False), (5e-4, 0.0, False)],
 )
-def test_nothing_sleeps_where_it_would_at_the_turning_point_of_its_flight(
-    timestep: float, gravity: float, sleeps: bool
-) -> None:
+def test_nothing_sleeps_in_flight(timestep: float, gravity: float, sleeps: bool) -> None:
     falling = mujoco.MjModel.from_xml_string(f"""
         <mujoco><option timestep="{timestep}" gravity="0 0 {-gravity}"/><worldbody>
           <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
@@ -123,3 +108,20 @@ def test_nothing_sleeps_where_it_would_at_the_turning_point_of_its_flight(
     for _ in range(round(0.3 / timestep)):
         mujoco.mj_step(model, data)
     assert data.qvel[2] == pytest.approx(-0.1 * gravity, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["puma560", "puma560_crossing"])
+def test_views_of_contacts_show_those_of_every_step(name: str) -> None:
+    made = cell(name)
+    data, other, seen = made.build_start_data(), made.build_start_data(), set()
+    views = build_contact_views(made.model, data)
+    for _ in range(600):
+        mj_step(made.model._address, data._address)
+        mujoco.mj_step(made.model, other)
+        seen.add(data.ncon)
+        assert views.number[0] == data.ncon
+        assert np.array_equal(views.geoms[: data.ncon], data.contact.geom)
+        assert np.array_equal(views.distance[: data.ncon], data.contact.dist)
+    assert len(seen) > 1
+    # Views change no motion, and the native function is that of the bindings.
+    assert (data.time, data.qpos.tolist()) == (other.time, other.qpos.tolist())

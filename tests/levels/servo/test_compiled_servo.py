@@ -34,8 +34,7 @@ def plain(value: Any) -> Any:
 
 
 def sample_of(seed: int, error: float) -> tuple[Any, ...]:
-    """Return the arguments of `check` for a sample off by up to `error`, rad; one joint shows no
-    change."""
+    """Return arguments of `check`: a sample off by `error`, rad; one joint shows no change."""
     estimate, passed_s = np.abs(noise(seed, 3, JOINTS)), 0.0025
     sample = estimate[:2] + 1e-3 * noise(seed + 1, 2, JOINTS)
     sample[1, seed % JOINTS] = estimate[1, seed % JOINTS]
@@ -48,21 +47,12 @@ def sample_of(seed: int, error: float) -> tuple[Any, ...]:
         joints[name] = 1e-4
     joints["last_position"], joints["last_velocity"] = estimate[:2]
     joints["last_position"][seed % JOINTS] = sample[0, seed % JOINTS]
-    joints["still_cycles"], joints["still_way"], joints["claimed"] = np.abs(
-        noise(seed + 3, 3, JOINTS)
-    ) * np.array([[9.0], [1e-3], [1e-5]])
+    scale = np.array([[9.0], [1e-3], [1e-5]])
+    still = np.abs(noise(seed + 3, 3, JOINTS)) * scale
+    joints["still_cycles"], joints["still_way"], joints["claimed"] = still
     unusual = (0.01, 5.0) if seed % 11 == 0 else (0.0, 0.0)
-    return (
-        joints,
-        estimate,
-        seed % 2 == 0,
-        *sample,
-        noise(seed + 4, 2, JOINTS),
-        passed_s,
-        *unusual,
-        seed % 5 > 0,
-        seed % 7 == 0,
-    )
+    state = joints, estimate, seed % 2 == 0, *sample, noise(seed + 4, 2, JOINTS), passed_s
+    return *state, *unusual, seed % 5 > 0, seed % 7 == 0
 
 
 def table(seed: int) -> Array:
@@ -77,16 +67,9 @@ def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     constants = ("dry", "friction_s", "exact_noise", "uncertain", "off")
     for name, row in zip(constants, np.abs(noise(seed + 2, 5, JOINTS)), strict=True):
         motors[name] = rules * row
-    return (
-        motors,
-        inertia[0],
-        200.0,
-        float(following),
-        noise(seed + 3, 3, JOINTS),
-        noise(seed + 5, 2, JOINTS),
-        inertia[1],
-        noise(seed),
-    )
+    reference, state = noise(seed + 3, 3, JOINTS), noise(seed + 5, 2, JOINTS)
+    following = float(following)
+    return motors, inertia[0], 200.0, following, reference, state, inertia[1], noise(seed)
 
 
 def wanted_of(seed: int) -> tuple[Any, ...]:
@@ -97,23 +80,14 @@ def wanted_of(seed: int) -> tuple[Any, ...]:
 
 
 def joints_of(seed: int) -> tuple[Any, ...]:
-    """Return the arguments of `servo_joints`: its torques are cut, NaN, or neither; some joints are
-    of other boards."""
+    """Return arguments of `servo_joints`: torques cut, NaN, or neither; joints of other boards."""
     limit, driven = (1.0, 1e5)[seed % 2], np.arange(JOINTS) % 2 == 0
     constants = np.outer((3600.0, 120.0, abs(noise(seed)[0]), limit, 0.0), np.ones(JOINTS))
     constants[4] = driven
     loads = np.abs(noise(seed + 1, 4, JOINTS)) * (np.nan if seed == 3 else 1.0)
     motion = noise(seed + 2, 2 * JOINTS), noise(seed + 3, 3, JOINTS)
-    return (
-        constants,
-        loads,
-        0.4,
-        0.001,
-        0.002,
-        *motion,
-        noise(seed + 4, 3 * JOINTS),
-        noise(seed + 5, 4 * JOINTS),
-    )
+    rows = noise(seed + 4, 3 * JOINTS), noise(seed + 5, 4 * JOINTS)
+    return constants, loads, 0.4, 0.001, 0.002, *motion, *rows
 
 
 CASES: dict[str, list[tuple[Any, ...]]] = {

@@ -62,14 +62,11 @@ class OffArm(IdealArm):
 
 def rig(folder: Path, arm: str = "StatefulArm", **robot: object) -> ServoRig:
     given = {"enable": None, **robot}
-    return ServoRig(
-        pendulum(folder, **given), SceneConfig(), name="own", arm=f"{__name__}:{arm}", patience=0.1
-    )
+    arm, params = pendulum(folder, **given), {"arm": f"{__name__}:{arm}", "patience": 0.1}
+    return ServoRig(arm, SceneConfig(), name="own", **params)
 
 
-def test_a_users_arm_waits_for_its_operator_and_moves_from_where_it_is(
-    tmp_path: Path,
-) -> None:
+def test_a_users_arm_waits_for_its_operator_and_moves_from_where_it_is(tmp_path: Path) -> None:
     servo = rig(tmp_path)
     operator = Operator(servo.rack)
     servo.run(200)
@@ -119,9 +116,7 @@ def test_a_drive_fault_is_the_reported_reason_until_reset_and_enable(tmp_path: P
 
 
 @pytest.mark.parametrize("kind", ["StatefulArm", "IdealArm"])
-def test_a_restarted_board_leaves_the_arm_disabled_or_enabled_as_it_was(
-    tmp_path: Path, kind: str
-) -> None:
+def test_a_restarted_board_leaves_the_arm_as_it_was(tmp_path: Path, kind: str) -> None:
     servo = rig(tmp_path, kind)
     operator = Operator(servo.rack)
     operator.say("servo", Operation.ENABLE)
@@ -145,9 +140,7 @@ def test_a_restarted_board_leaves_the_arm_disabled_or_enabled_as_it_was(
 
 
 @pytest.mark.slow
-def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_restart(
-    tmp_path: Path,
-) -> None:
+def test_bring_up_slows_the_operators_set_points_until_released(tmp_path: Path) -> None:
     servo = rig(tmp_path, "IdealArm", enable="at-start", bring_up=0.1)
     operator = Operator(servo.rack)
     servo.run(2)
@@ -175,14 +168,11 @@ def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_rest
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 2])
-def test_offsets_convert_drive_positions_to_joint_positions(
-    tmp_path: Path, latency_ticks: int
-) -> None:
+def test_offsets_convert_positions_of_drives(tmp_path: Path, latency_ticks: int) -> None:
     calibration = {"offset": (0.1, -0.2)}
     own = rig(tmp_path, "OffArm", enable="at-start", calibration=calibration)
-    simulated = ServoRig(
-        pendulum(tmp_path, calibration=calibration, latency_ticks=latency_ticks), SceneConfig()
-    )
+    robot = pendulum(tmp_path, calibration=calibration, latency_ticks=latency_ticks)
+    simulated = ServoRig(robot, SceneConfig())
     course = Course(START, GOAL, 0.8)
     for servo in (own, simulated):
         servo.run(500, course.at)
@@ -195,9 +185,7 @@ def test_offsets_convert_drive_positions_to_joint_positions(
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
-def test_guessed_values_keep_a_users_arm_disabled_but_not_a_simulated_one(
-    tmp_path: Path,
-) -> None:
+def test_guessed_values_keep_a_users_arm_disabled_but_not_a_simulated_one(tmp_path: Path) -> None:
     guessed = ("velocity", "torque")
     for enable in ("at-start", None):
         servo = rig(tmp_path, enable=enable, guessed=guessed)

@@ -14,7 +14,7 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.servo.curves import Bridge, Curve
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import ROBOTS, cell, config
-from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
+from tests.levels.servo.rig import HOME, PERIOD, TICK_S, Course, ServoRig
 
 GOALS = {
     "puma560": [0.6, 1.0, -2.6, 0.4, -1.2, 0.5],
@@ -26,8 +26,8 @@ def rig_of(name: str, **params: float) -> ServoRig:
     return ServoRig(*config(name), **params)
 
 
-def course(name: str, duration_s: float = 2.0) -> Course:
-    return Course(np.array(config(name)[0].home), np.array(GOALS[name]), duration_s)
+def course(name: str) -> Course:
+    return Course(np.array(config(name)[0].home), np.array(GOALS[name]), 2.0)
 
 
 def steps_of(values: list[Array]) -> Array:
@@ -82,21 +82,20 @@ def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:
     assert rig.state.tick == rig.rack.tick - 1
 
 
-def garbage(kind: str, home: Array) -> tuple[Array, Array]:
-    still = np.zeros_like(home)
-    return {
-        "nan": (home * np.nan, still),
-        "nan velocity": (home, still * np.nan),
-        "far": (home + 100.0, still),
-        "fast": (home, still + 1e6),
-        "jump": (home + 0.4, still),
-    }[kind]
+STILL = np.zeros(6)
+GARBAGE = {
+    "nan": (HOME * np.nan, STILL),
+    "nan velocity": (HOME, STILL * np.nan),
+    "far": (HOME + 100.0, STILL),
+    "fast": (HOME, STILL + 1e6),
+    "jump": (HOME + 0.4, STILL),
+}
 
 
-@pytest.mark.parametrize("kind", ["nan", "nan velocity", "far", "fast", "jump"])
+@pytest.mark.parametrize("kind", GARBAGE)
 def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> None:
     (robot, _), rig = config("puma560"), rig_of("puma560")
-    wrong = garbage(kind, np.array(robot.home))
+    wrong = GARBAGE[kind]
     for _ in range(25):
         rig.run(PERIOD, lambda _: wrong)
         assert (np.abs(rig.status.velocity) <= robot.velocity).all()
@@ -106,7 +105,7 @@ def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> Non
     if kind in ("nan", "fast"):
         # Good ones are followed again.
         goal = course("puma560").goal
-        rig.run(1600, lambda _: (goal, np.zeros(6)))
+        rig.run(1600, lambda _: (goal, STILL))
         assert rig.status.position == pytest.approx(goal, abs=1e-3)
 
 
@@ -132,17 +131,15 @@ def grasping(tmp_path: Path) -> ServoRig:
     """A servo level whose gripper closes on a weight that starts to fall between the fingers."""
     robot, _ = config("puma560")
     model = tmp_path / "weight.xml"
-    model.write_text(
-        (ROBOTS / "puma560.xml").read_text().replace("<worldbody>", f"<worldbody>{WEIGHT}", 1)
-    )
+    text = (ROBOTS / "puma560.xml").read_text()
+    model.write_text(text.replace("<worldbody>", f"<worldbody>{WEIGHT}", 1))
     rig = ServoRig(robot.model_copy(update={"model": model}), SceneConfig(objects=("weight",)))
     rig.command.opening, rig.command.force, rig.command.held = 0.0, 40.0, 0
     return rig
 
 
 def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping: ServoRig) -> None:
-    home = np.array(config("puma560")[0].home)
-    grasping.run(400, lambda _: (home, np.zeros(6)))
+    grasping.run(400, lambda _: (HOME, STILL))
     plan, scene = grasping.rack.read("servo.plan"), grasping.rack.read("servo.scene")
     assert (plan.held, plan.payload_mass) == (0, pytest.approx(1.5))
     assert plan.payload_offset == pytest.approx([0, 0, 0.0], abs=0.01)
@@ -150,9 +147,9 @@ def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping:
     assert grasping.status.opening == pytest.approx(0.025, abs=1e-3)
     assert grasping.status.grip_force == -40.0
     assert grasping.status.touches == 0
-    load = Dynamics(cell("puma560"))
-    bare = load.terms(home, np.zeros(6)).bias.copy()
-    assert grasping.status.torque[1] - bare[1] == pytest.approx(1.5 * 9.81 * 0.5, rel=0.05)
+    bare = Dynamics(cell("puma560")).terms(HOME, STILL).bias
+    lifted = grasping.status.torque[1] - bare[1]
+    assert lifted == pytest.approx(1.5 * 9.81 * 0.5, rel=0.05)
     # A restart does not drop it.
     grasping.miss(10_000)
     for _ in range(100):

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
-from rack.levels.level import LevelContext, Pace
+from rack.levels.level import Pace
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.arm_executor import JointTorques
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads
 from rack.levels.systems.joint_boards.messages import JointReference, JointTorque
-from tests.levels.arms import cell, config
+from tests.levels.arms import cell, config, context
 from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS
 
 SIZES = {"joints": len(JOINTS)}
@@ -32,11 +32,8 @@ def reference(due: int, inertia: float, load: float) -> Message:
 def torque(sampled: int, joint: int, newton_metres: float) -> Message:
     message = JointTorque.zeros(SIZES)
     message.sampled = sampled
-    message.torque[joint], message.target[joint], message.target_velocity[joint] = (
-        newton_metres,
-        0.1 * joint,
-        0.2,
-    )
+    message.torque[joint], message.target[joint] = newton_metres, 0.1 * joint
+    message.target_velocity[joint] = 0.2
     return message
 
 
@@ -44,10 +41,8 @@ def joint_torques() -> JointTorques:
     """Return the torques of two boards, one as fast as the arm and one at half its rate."""
     robot, scene = config("puma560")
     pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
-    return JointTorques(
-        LevelContext("arm", 1, 1, CLOCK_NS, 0, robot, scene, {}, SIZES, pace),
-        build_cell(robot, scene, CLOCK_NS),
-    )
+    level = context("arm", (robot, scene), seed=0, sizes=SIZES, above=pace)
+    return JointTorques(level, build_cell(robot, scene, CLOCK_NS))
 
 
 def readings(fast: Message, slow: Message) -> dict[str, Reading]:
@@ -86,9 +81,7 @@ def test_loads_of_a_holding_arm_are_computed_again_only_after_it_has_moved() -> 
         *(("payload_mass", value) for value in (-1.0, 100.0, 1e308)),
     ],
 )
-def test_a_reference_that_asks_for_more_than_the_arm_can_do_is_named(
-    field: str, value: float
-) -> None:
+def test_a_reference_beyond_the_arm_is_named(field: str, value: float) -> None:
     puma = cell("puma560")
     loads = JointLoads(puma)
     message = reference(20, 1.0, 1.0)
@@ -100,12 +93,8 @@ def test_a_reference_that_asks_for_more_than_the_arm_can_do_is_named(
 
 def test_torques_of_all_boards_are_added_up() -> None:
     torques, fast, slow = joint_torques(), torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0)
-    slow.grip_force, slow.payload_mass, slow.payload_offset, slow.operator = (
-        12.0,
-        0.3,
-        (0.0, 0.1, 0.2),
-        4,
-    )
+    slow.grip_force, slow.operator = 12.0, 4
+    slow.payload_mass, slow.payload_offset = 0.3, (0.0, 0.1, 0.2)
     read = readings(fast, slow)
     assert torques.find_missing(read, TICK, since=0) == ""
     torques.sum_commands(read)
@@ -115,38 +104,23 @@ def test_torques_of_all_boards_are_added_up() -> None:
     assert (torques.payload.mass, torques.payload.offset.tolist()) == (0.3, [0.0, 0.1, 0.2])
 
 
-MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
-    "lost": (
-        lambda read: read.update(slow=read["slow"]._replace(is_lost=True)),
-        0,
-        "board 'slow' is lost: braked until it is back",
-    ),
-    "never sent": (
-        lambda read: read.update(fast=read["fast"]._replace(verdict=Verdict.NONE)),
-        0,
-        "no torque from board 'fast' yet",
-    ),
-    "sent before the arm's first status": (
-        lambda read: setattr(read["fast"].message, "sampled", -1),
-        0,
-        "no torque from board 'fast' yet",
-    ),
-    "stale, by its own cycle": (
-        lambda read: setattr(read["slow"].message, "sampled", TICK - 8),
-        0,
-        "stale torque from board 'slow': based on a status more than 7 ticks old",
-    ),
-    "from before the brakes engaged": (
-        lambda read: None,
-        TICK - 2,
-        "braked until the boards above have seen it",
-    ),
+STALE = "stale torque from board 'slow': based on a status more than 7 ticks old"
+MISSING: dict[str, tuple[str, Any, str]] = {
+    "lost": ("is_lost", True, "board 'slow' is lost: braked until it is back"),
+    "never sent": ("verdict", Verdict.NONE, "no torque from board 'slow' yet"),
+    "sent before the arm's first status": ("sampled", -1, "no torque from board 'slow' yet"),
+    "stale, by its own cycle": ("sampled", TICK - 8, STALE),
+    "from before the brakes engaged": ("", 0, "braked until the boards above have seen it"),
 }
 
 
 @pytest.mark.parametrize("case", MISSING)
 def test_a_missing_or_invalid_torque_is_reported_with_its_board(case: str) -> None:
-    spoil, since, reason = MISSING[case]
+    field, value, reason = MISSING[case]
     read = readings(torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0))
-    spoil(read)
+    if field == "sampled":
+        read["slow"].message.sampled = value
+    elif field:
+        read["slow"] = read["slow"]._replace(**{field: value})
+    since = 0 if field else TICK - 2
     assert joint_torques().find_missing(read, TICK, since) == reason

@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
-from rack.levels.level import Finding, LevelContext
+from rack.levels.level import Finding
 from rack.levels.servo.common_modifications import DeadZone, JointPd, Notch
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import (
@@ -23,7 +23,7 @@ from rack.levels.servo.modification import (
     Modification,
 )
 from rack.levels.servo.modified_law import ModifiedLaw
-from tests.levels.arms import cell, config
+from tests.levels.arms import cell, config, context
 
 TICK_NS = 1_000_000
 TRANSFER_TICKS = 50
@@ -115,16 +115,13 @@ class Bench:
     """A modified law with torque = 3 N m + 10 N m/rad times the wanted position."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
-        tables = {
-            n: {"class": HERE + m} if isinstance(m, str) else m for n, m in modifications.items()
-        }
-        robot, scene = config("puma560")
-        context = LevelContext("servo", 1, 1, TICK_NS, 0, robot, scene, {}, {})
+        named = {n: {"class": HERE + m} for n, m in modifications.items() if isinstance(m, str)}
+        level = context("servo", config("puma560"), clock_ns=TICK_NS, seed=0)
         self.findings: list[Finding] = []
-        params = ModifiableParams.model_validate(
-            {"modifications": tables, "transfer": TRANSFER_TICKS * TICK_NS * 1e-9}
+        params = ModifiableParams(
+            modifications=modifications | named, transfer=TRANSFER_TICKS * TICK_NS * 1e-9
         )
-        self.law = ModifiedLaw(context, params, LIMITS, self.findings)
+        self.law = ModifiedLaw(level, params, LIMITS, self.findings)
         self.tick = 0
 
     def switch(self, name: str, is_on: bool) -> str:
@@ -136,9 +133,8 @@ class Bench:
         for _ in range(samples):
             motion = Motion(np.zeros((3, JOINTS)))
             motion.position[:] = wanted(self.tick)
-            found.append(
-                self.law.compute_torque(self._law, motion, STATE, INERTIA, LOAD, self.tick)[2]
-            )
+            given = motion, STATE, INERTIA, LOAD, self.tick
+            found.append(self.law.compute_torque(self._law, *given)[2])
             self.tick += 1
         return np.array(found)
 
@@ -147,14 +143,8 @@ class Bench:
         return 3.0 + 10.0 * motion.position + 0.0 * state[1]
 
 
-@pytest.mark.parametrize(
-    ("name", "after"),
-    [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)],
-    ids=["after", "before", "instead"],
-)
-def test_after_a_switch_the_torque_changes_over_smoothly_in_the_transfer_time(
-    name: str, after: float
-) -> None:
+@pytest.mark.parametrize(("name", "after"), [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)])
+def test_after_a_switch_the_torque_changes_smoothly(name: str, after: float) -> None:
     bench = Bench(it=name)
     bench.run(5)
     assert bench.switch("it", True) == ""
@@ -170,10 +160,8 @@ def test_after_a_switch_the_torque_changes_over_smoothly_in_the_transfer_time(
 
 
 def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
-    tables = {
-        name: {"class": HERE + kind, "on": True}
-        for name, kind in (("half", "Half"), ("counts", "Counts"), ("further", "Further"))
-    }
+    kinds = {"half": "Half", "counts": "Counts", "further": "Further"}
+    tables = {name: {"class": HERE + kind, "on": True} for name, kind in kinds.items()}
     assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
 
 
@@ -202,10 +190,8 @@ def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sampl
     # The failure itself is a switch: no step.
     assert np.abs(np.diff(torque)).max() < 0.1
     assert bench.findings == [Finding(Alarm.MODIFICATION, 0)]
-    assert (
-        bench.law.reason
-        == "modification 'raises' taken out: ZeroDivisionError: left nothing; modified by half"
-    )
+    why = "modification 'raises' taken out: ZeroDivisionError: left nothing; modified by half"
+    assert bench.law.reason == why
     bench.switch("raises", False)
     assert bench.law.reason == "modified by half"
 
@@ -244,9 +230,8 @@ def test_a_dead_zone_hides_small_errors_and_reduces_larger_ones(error: float, se
 
 
 def test_pd_controls_each_joint_separately_with_or_without_load() -> None:
-    sample = sample_of(
-        wanted_position=0.1, wanted_velocity=0.2, inertia=2.0, load=7.0, torque=np.nan
-    )
+    wanted = {"wanted_position": 0.1, "wanted_velocity": 0.2}
+    sample = sample_of(**wanted, inertia=2.0, load=7.0, torque=np.nan)
     JointPd(law_of(bandwidth=10.0, damping=0.5)).modify(sample)
     assert sample.torque == pytest.approx(2.0 * (100.0 * 0.1 + 10.0 * 0.2) + 7.0)
     JointPd(law_of(bandwidth=10.0, damping=0.5, load=False)).modify(sample)
@@ -256,13 +241,10 @@ def test_pd_controls_each_joint_separately_with_or_without_load() -> None:
 @pytest.mark.parametrize(
     ("frequency", "least", "most"), [(60.0, 0.0, 0.02), (3.0, 0.99, 1.01), (200.0, 0.9, 1.01)]
 )
-def test_a_notch_removes_its_frequency_and_passes_others(
-    frequency: float, least: float, most: float
-) -> None:
+def test_a_notch_removes_only_its_frequency(frequency: float, least: float, most: float) -> None:
     notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
-    with pytest.raises(
-        LevelError, match="frequency = 500 Hz: must be below half the law's rate, 500 Hz"
-    ):
+    why = "frequency = 500 Hz: must be below half the law's rate, 500 Hz"
+    with pytest.raises(LevelError, match=why):
         Notch(law_of(frequency=500.0))
     # It begins without a transient.
     notch.begin(sample)
@@ -275,33 +257,23 @@ def test_a_notch_removes_its_frequency_and_passes_others(
     assert least <= np.abs(np.array(passed[500:]) - 5.0).max() <= most
 
 
+HALF, ZONE = {"class": HERE + "Half"}, {"class": COMMON + "DeadZone"}
+HOOKS = "must be one of before, instead, after"
 MISTAKES = {
     "no class": ({"class": COMMON + "Notsch"}, "has no class 'Notsch'"),
     "another class": (
         {"class": "rack.levels.servo:ServoExecutor"},
         "has no Modification named 'ServoExecutor'",
     ),
-    "half a class": (
-        {"class": HERE + "Unfinished"},
-        "class 'Unfinished' does not implement: modify",
-    ),
-    "no hook": (
-        {"class": HERE + "Hookless"},
-        "class 'Hookless' has the hook None; must be one of before, instead, after",
-    ),
-    "unknown hook": (
-        {"class": HERE + "Later"},
-        "class 'Later' has the hook 'later'; must be one of before, instead, after",
-    ),
+    "half a class": ({"class": HERE + "Unfinished"}, "'Unfinished' does not implement: modify"),
+    "no hook": ({"class": HERE + "Hookless"}, f"'Hookless' has the hook None; {HOOKS}"),
+    "unknown hook": ({"class": HERE + "Later"}, f"'Later' has the hook 'later'; {HOOKS}"),
     "params of one without": (
-        {"class": HERE + "Half", "params": {"gain": 2.0}},
+        {**HALF, "params": {"gain": 2.0}},
         "'Half' takes no params; remove them",
     ),
-    "params": (
-        {"class": COMMON + "DeadZone", "params": {"width": -1.0}},
-        "params.width = -1.0: input should be",
-    ),
-    "unknown key": ({"class": HERE + "Half", "onn": True}, "Extra inputs"),
+    "params": ({**ZONE, "params": {"width": -1.0}}, "params.width = -1.0: input should be"),
+    "unknown key": ({**HALF, "onn": True}, "Extra inputs"),
 }
 
 
@@ -319,8 +291,6 @@ class Later(Hookless):
 
 
 @pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
-def test_a_table_of_a_modification_is_checked_with_its_class(
-    table: Mapping[str, Any], expected: str
-) -> None:
+def test_a_table_is_checked_with_its_class(table: Mapping[str, Any], expected: str) -> None:
     with pytest.raises(ValueError, match=re.escape(expected)):
         ModifiableParams.model_validate({"modifications": {"it": table}})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -26,7 +27,9 @@ from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
 
 COURSE = Course(START, GOAL, 0.8)
-OWN = "tests.levels.servo.test_set_point_law:"
+OWN = f"{__name__}:"
+PD = "rack.levels.servo.common_modifications:JointPd"
+IDEAL = "tests.levels.arm.test_own_arm:IdealArm"
 STUCK_AT = 150
 
 
@@ -42,6 +45,11 @@ class StuckServoArm(ServoArm):
         return found
 
 
+@pytest.fixture(params=SET_POINTS)
+def interface(request: pytest.FixtureRequest) -> Interface:
+    return cast(Interface, request.param)
+
+
 def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> ServoRig:
     params = {"arm": arm} if arm else {}
     return ServoRig(pendulum(folder, interface=interface, **robot), SceneConfig(), **params)
@@ -49,10 +57,7 @@ def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> S
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", ["", OWN + "ServoArm"])
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_the_arm_follows_a_motion_by_set_points(
-    tmp_path: Path, interface: Interface, arm: str
-) -> None:
+def test_the_arm_follows_its_set_points(tmp_path: Path, interface: Interface, arm: str) -> None:
     servo = rig(tmp_path, interface, arm)
     servo.run(500, COURSE.at)
     assert np.abs(servo.errors(COURSE.at)).max() < 8e-3
@@ -77,35 +82,28 @@ def test_the_end_of_a_bring_up_does_not_move_the_set_points(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_after_missed_cycles_the_first_set_point_is_where_the_arm_is(
-    tmp_path: Path, interface: Interface
-) -> None:
+def test_missed_cycles_end_where_the_arm_is(tmp_path: Path, interface: Interface) -> None:
     servo = rig(tmp_path, interface)
     random = np.random.default_rng(4)
-    course = Course(START, GOAL, 0.8)
-    servo.run(5, course.at)
+    servo.run(5, COURSE.at)
     servo.miss(12)
-    servo.run(20, course.at)
+    servo.run(20, COURSE.at)
     assert servo.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
     assert servo.found[0].finding.subject == BRAKED_WITHOUT_TORQUE
     for _ in range(20):
-        servo.run(int(random.integers(5, 20)), course.at)
+        servo.run(int(random.integers(5, 20)), COURSE.at)
         # Some of these outlast the patience of the drives.
         servo.miss(int(random.integers(1, 7)))
     # So it is after a restart.
     servo.restart()
-    servo.run(400, course.at)
+    servo.run(400, COURSE.at)
     assert set(servo.alarms()) == {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
     assert np.abs(servo.status.position - GOAL).max() < 5e-4
     assert servo.status.violations == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_a_weak_motor_is_found_by_the_torque_that_drives_report(
-    tmp_path: Path, interface: Interface
-) -> None:
+def test_a_weak_motor_is_found_by_its_torque(tmp_path: Path, interface: Interface) -> None:
     servo = rig(tmp_path, interface)
     servo.run(100, COURSE.at)
     since = servo.inject("actuator-off", joint=0)
@@ -121,10 +119,7 @@ def test_a_weak_motor_is_found_by_the_torque_that_drives_report(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_a_drive_that_does_not_follow_is_a_motor_fault(
-    tmp_path: Path, interface: Interface
-) -> None:
+def test_a_drive_that_is_stuck_is_a_motor_fault(tmp_path: Path, interface: Interface) -> None:
     servo = rig(tmp_path, interface, OWN + "StuckServoArm")
     servo.run(STUCK_AT, COURSE.at)
     assert not servo.alarms()
@@ -136,7 +131,6 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
     assert "motor of 'elbow'" in servo.status.reason
 
 
-@pytest.mark.parametrize("interface", SET_POINTS)
 def test_set_points_are_for_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
     cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
     law = SetPointLaw(cell, LoopGains(), TICK_S)
@@ -154,28 +148,21 @@ def test_set_points_are_for_the_end_of_the_cycle(tmp_path: Path, interface: Inte
 
 
 @pytest.mark.parametrize(
-    ("rack", "changes", "mistake"),
+    ("rack", "change", "mistake"),
     [
-        ("rccl", [], 'board.arm.executor = "ArmExecutor": it gives torques'),
-        ("penn", [], 'board.arm.executor = "ForceArmExecutor": it gives torques'),
-        ("hic", [], 'robot.interface = "position": tendons of a hand need tensions'),
+        ("rccl", "", 'board.arm.executor = "ArmExecutor": it gives torques'),
+        ("penn", "", 'board.arm.executor = "ForceArmExecutor": it gives torques'),
+        ("hic", "", 'robot.interface = "position": tendons of a hand need tensions'),
+        ("k1607", f"arm='{IDEAL}'", f'board.servo.params.arm = "{IDEAL}": no `follow`'),
         (
             "k1607",
-            ["board.servo.params.arm='tests.levels.arm.test_own_arm:IdealArm'"],
-            'board.servo.params.arm = "tests.levels.arm.test_own_arm:IdealArm": no `follow`',
-        ),
-        (
-            "k1607",
-            [
-                "board.servo.params.modifications.pd.class='rack.levels.servo.common_modifications:JointPd'"
-            ],
+            f"modifications.pd.class='{PD}'",
             'board.servo.params.modifications = "pd": they modify a law of torques',
         ),
     ],
 )
-def test_settings_that_need_torques_are_refused_with_set_points(
-    rack: str, changes: list[str], mistake: str
-) -> None:
+def test_settings_that_need_torques_are_refused(rack: str, change: str, mistake: str) -> None:
+    changes = [f"board.servo.params.{change}"] if change else []
     with pytest.raises(ConfigError) as caught:
         resolve(load(rack, ["robot.interface='position'", *changes]))
     (line,) = str(caught.value).splitlines()

@@ -9,22 +9,15 @@ from typing import Any, cast
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
-from rack.levels.systems.figures import FigureExecutor, FigurePlan, FigurePlanner, FigureStatus
+from rack.levels.systems.figures import FigureExecutor, FigurePlanner, FigureStatus
 
 MS = 1_000_000
 
 
 def context(**params: Any) -> LevelContext:
     return cast(LevelContext, SimpleNamespace(every=4, params=params, sizes={}))
-
-
-def plan_of(tick: int) -> Message:
-    found = FigurePlan.zeros({})
-    found.made_at = tick
-    return found
 
 
 def computing_ns(executor: FigureExecutor, tick: int) -> int:
@@ -42,12 +35,8 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
     # Several times are repeated in order.
     executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
     # A skipped cycle also skips its time.
-    assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [
-        True,
-        False,
-        False,
-        True,
-    ]
+    long = [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)]
+    assert long == [True, False, False, True]
 
 
 def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
@@ -70,8 +59,6 @@ def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
         ({"proces_ms": 1.0}, "keys: process_ms, plan_ms"),
     ],
 )
-def test_an_invalid_time_is_refused_with_the_name_of_its_key(
-    params: dict[str, Any], message: str
-) -> None:
+def test_an_invalid_time_is_refused_by_its_key(params: dict[str, Any], message: str) -> None:
     with pytest.raises(LevelError, match=message):
         FigureExecutor(context(**params))

@@ -1,5 +1,4 @@
-"""The task level alone: the test plays its planner and the level below, or the arm and the
-world."""
+"""The task level alone: the test plays its planner and the level below, or arm and world."""
 
 from __future__ import annotations
 
@@ -111,16 +110,10 @@ HELD = {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
         ([0], {"current": 1, **HELD}, HELD["reason"]),
         ([0], {"current": 1}, "move 1 is under way"),
         ([0], {}, "no path yet for move 1"),
-        (
-            [],
-            {},
-            "no plan yet: the objects must be at rest and the position of the arm known",
-        ),
+        ([], {}, "no plan yet: the objects must be at rest and the position of the arm known"),
     ],
 )
-def test_a_stalled_task_ends_with_the_reason(
-    plan: list[int], below: dict[str, Any], why: str
-) -> None:
+def test_a_stalled_task_has_a_reason(plan: list[int], below: dict[str, Any], why: str) -> None:
     bench = Bench(HOME, stalled_s=5.0)
     if plan:
         bench.plan(plan)
@@ -148,10 +141,9 @@ class Obedient(Executor):
 
 
 class PlannedBench(Lockstep):
-    """Executor and planner of the task level; the arm is at home, and resting objects are seen from
-    tick `seen` on."""
+    """Executor and planner of the task level; arm and resting objects are seen from tick 4 on."""
 
-    def __init__(self, *actions: Mapping[str, Any], seen: int = 4) -> None:
+    def __init__(self, *actions: Mapping[str, Any]) -> None:
         outside = {"servo.status": ServoStatus, "world.model": WorldState}
         boards = [
             BoardSpec("task", 400, TaskExecutor, TaskPlanner, 2, below="elemental_move"),
@@ -161,7 +153,7 @@ class PlannedBench(Lockstep):
         servo = self.message("servo.status")
         servo.target = np.array(ROBOT.home)
         self.after(4, lambda: self.write("servo.status", servo))
-        self.after(seen, self._show)
+        self.after(4, self._show)
 
     def _show(self) -> None:
         puma, world = cell("puma560"), self.message("world.model")
@@ -171,22 +163,19 @@ class PlannedBench(Lockstep):
         self.write("world.model", world)
 
     def run_to_end(self) -> tuple[Message, int]:
-        """Run until the task is done or 20 s have passed; return its status, and how often a plan
-        was published."""
+        """Run until the task is done, at most 20 s; return its status and the number of plans."""
         self.run(20.0, until=lambda rack: rack.read("task.status").state == State.DONE)
         return self.read("task.status"), self.boxes["task.plan"].at(self.tick)[0]
 
 
 @pytest.mark.parametrize(
-    ("finished", "away_ticks", "published"),
+    ("finished", "away", "published"),
     [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
     ids=["plan on its way", "plan followed", "plan never made"],
 )
-def test_a_restarted_planner_plans_only_a_lost_plan_again(
-    finished: bool, away_ticks: int, published: int
-) -> None:
+def test_a_restarted_planner_replans_only_once(finished: bool, away: int, published: int) -> None:
     bench = PlannedBench(HOME)
-    bench.after(500, lambda: bench.lose("task.planner", away_ticks, finished))
+    bench.after(500, lambda: bench.lose("task.planner", away, finished))
     status, plans = bench.run_to_end()
     assert (status.state, plans) == (State.DONE, published)
     bench.run(5.0)

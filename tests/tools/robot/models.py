@@ -20,36 +20,29 @@ def link(name: str, size: str, at: str, mass: float = 1.0, inertia: float = 0.01
     return LINK.format(name=name, half=0.02, mass=mass, inertia=inertia, at=at, size=size)
 
 
-def joint(
-    name: str, parent: str, child: str, at: str, axis: str, *, limit: str, kind: str = "revolute",
-    mimic: str = "",
-) -> str:  # fmt: skip
-    return JOINT.format(
-        name=name, kind=kind, parent=parent, child=child, at=at, axis=axis, limit=limit, mimic=mimic
-    )
+def joint(name: str, parent: str, child: str, at: str, axis: str, **given: str) -> str:
+    """Return a joint with `limit`, of `kind`, which may `mimic` another one."""
+    more = {"kind": "revolute", "mimic": ""} | given
+    return JOINT.format(name=name, parent=parent, child=child, at=at, axis=axis, **more)
 
 
 def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: bool = False) -> str:
     """Return an arm of six joints as URDF.
 
     With `gripper` it has two fingers, of which one mimics the other if `mimics`. With `jaw` it has
-    one
-    finger that turns towards a fixed jaw instead.
+    one finger that turns towards a fixed jaw instead.
     """
     parts = [link("base", "0.1 0.1 0.1", "0 0 0")]
-    parent = "base"
-    below = 0.05
+    parent, below = "base", 0.05
     for number, (length, axis) in enumerate(zip(LENGTHS, AXES, strict=True), 1):
         limit = LIMIT.format(low=-2.8, high=2.8, effort=effort)
         parts.append(link(f"l{number}", f"0.04 0.04 {length * 0.6}", f"0 0 {length / 2}"))
         parts.append(joint(f"j{number}", parent, f"l{number}", f"0 0 {below}", axis, limit=limit))
-        parent = f"l{number}"
-        below = length
+        parent, below = f"l{number}", length
     if gripper:
         parts.append(link("hand", "0.04 0.12 0.02", "0 0 0.01", 0.3, 0.001))
-        parts.append(
-            joint("mount", parent, "hand", f"0 0 {below}", "0 0 1", limit="", kind="fixed")
-        )
+        mount = {"limit": "", "kind": "fixed"}
+        parts.append(joint("mount", parent, "hand", f"0 0 {below}", "0 0 1", **mount))
         limit = LIMIT.format(low=0, high=0.04, effort=30)
         if jaw:
             parts += turning_finger()
@@ -57,11 +50,8 @@ def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: b
         for side, name in ((1, "left"), (-1, "right")):
             parts.append(link(name, "0.02 0.01 0.06", f"0 {0.005 * side} 0.03", 0.1, 0.0001))
             mimic = '<mimic joint="left_finger"/>' if side < 0 and mimics else ""
-            finger = f"{name}_finger"
-            parts.append(
-                joint(finger, "hand", name, "0 0 0.02", f"0 {side} 0", limit=limit,
-                      kind="prismatic", mimic=mimic)
-            )  # fmt: skip
+            moves = {"limit": limit, "kind": "prismatic", "mimic": mimic}
+            parts.append(joint(f"{name}_finger", "hand", name, "0 0 0.02", f"0 {side} 0", **moves))
     return f'<robot name="small">{"".join(parts)}</robot>'
 
 

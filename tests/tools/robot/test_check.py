@@ -50,9 +50,7 @@ def test_contacts_at_home_unattached_bodies_and_endless_falls_fail(tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["a.xml", "a.sdf"])
-def test_a_file_that_is_not_a_model_is_refused_with_valid_formats(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_file_that_is_not_a_model_is_refused(name: str, tmp_path: Path) -> None:
     done = rack("robot", "check", written(tmp_path, "<sdf/>", name), folder=tmp_path)
     assert done.returncode == 2
     assert "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)\n" in done.stderr

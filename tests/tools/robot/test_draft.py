@@ -9,12 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from rack.levels.errors import Refused
 from rack.levels.robot.dynamics import Dynamics
+from rack.tools.robot import assignment
 from rack.tools.robot.assignment import Assignment
 from rack.tools.robot.draft import EMPTY_SCENE, ArmOptions, draft_arm
 from rack.tools.robot.folder import format_config
 from rack.tools.robot.source import read_source
 from tests.tools.robot.models import urdf, written
+
+pytestmark = pytest.mark.slow
 
 DRY_N_M = 30.0
 SPEED = 0.3  # rad/s
@@ -26,7 +30,6 @@ def with_friction(text: str) -> str:
     return text.replace("<axis", f'<dynamics friction="{DRY_N_M}"/><axis')
 
 
-@pytest.mark.slow
 def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Path) -> None:
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
     made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
@@ -44,7 +47,6 @@ def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Pa
     assert -data.qfrc_constraint[cell.dof] == pytest.approx(friction, rel=0.01)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "bandwidth"), [(0.2, None), (1.0, STIFF), (30.0, 100.0)])
 def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
     friction: float, bandwidth: float | None, tmp_path: Path
@@ -53,6 +55,14 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
     made = draft_arm(read_source(written(tmp_path, model)), ArmOptions(), tmp_path, "drafted")
     assert made.limits.bandwidth == bandwidth
     text = format_config(made, Assignment(EMPTY_SCENE, [], "nothing"), "drafted", made.model)
-    assert tomllib.loads(text).get("board", {}) == (
-        {"servo": {"params": {"bandwidth": bandwidth}}} if bandwidth else {}
-    )
+    servo = {"servo": {"params": {"bandwidth": bandwidth}}}
+    assert tomllib.loads(text).get("board", {}) == (servo if bandwidth else {})
+
+
+def test_a_rehearsal_ends_with_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = draft_arm(read_source(written(tmp_path, urdf())), ArmOptions(), tmp_path, "drafted")
+    home = [{"do": "home"}]
+    assignment._rehearse_program(made, EMPTY_SCENE, home)
+    monkeypatch.setattr(assignment, "REHEARSAL_S", 0.0)
+    with pytest.raises(Refused, match="no way found in 0 s of processor time"):
+        assignment._rehearse_program(made, EMPTY_SCENE, home)

@@ -34,7 +34,7 @@ def test_an_uncoupled_finger_follows_as_a_guess(tmp_path: Path) -> None:
 
 def test_one_drive_closes_a_hand_of_two_with_the_force_of_both(tmp_path: Path) -> None:
     fingers = grippers.sides(grippers.SLIDE)
-    robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", MOTOR)
+    robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", actuator=MOTOR)
     gripper = gripper_of(drafted(tmp_path, robot.model))
     assert gripper.follow == (FollowConfig(joint="finger_right", ratio=1.0),)
     assert (gripper.actuator, gripper.joint) == ("grip", "finger_left")
@@ -51,9 +51,8 @@ def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: 
     assert fingertips.has_one_finger
     # The jaw is at y = -35 mm of the hand, the finger opens 75 mm from it.
     assert fingertips.block_width == pytest.approx(0.35 * 0.075)
-    assert fingertips.tool.position[1] == pytest.approx(
-        -0.035 + 0.5 * fingertips.block_width, abs=1e-4
-    )
+    beside = -0.035 + 0.5 * fingertips.block_width
+    assert fingertips.tool.position[1] == pytest.approx(beside, abs=1e-4)
     assert "finger and fixed jaw" in made.guessed["tool"]
 
 

@@ -73,6 +73,14 @@ KEPT = (
 )
 
 
+COUNTS = ("njnt", "neq", "ntendon", "nu", "nsensor")
+
+
+def assert_has_one_joint(model: mujoco.MjModel, *counts: str) -> None:
+    found = {name: int(getattr(model, name)) for name in counts}
+    assert found == dict.fromkeys(found, 0) | {"njnt": 1}
+
+
 def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
     """Return a model in which everything except its arm was fixed."""
     text = MODEL.format(inside=inside, outside=outside)
@@ -86,19 +94,14 @@ def test_elements_that_refer_to_a_removed_body_are_removed(tmp_path: Path, case:
     text = GONE[case]
     is_inside = case in ("camera", "light")
     model = held(tmp_path, text if is_inside else "", "" if is_inside else text)
-    counts = ("njnt", "ncam", "nlight", "npair", "nexclude", "neq", "ntendon", "nu", "nsensor")
-    found = {name: int(getattr(model, name)) for name in (*counts, "ntuple", "nskin")}
-    assert found == dict.fromkeys(found, 0) | {"njnt": 1}
+    assert_has_one_joint(model, *COUNTS, "ncam", "nlight", "npair", "nexclude", "ntuple", "nskin")
 
 
 @pytest.mark.parametrize("case", GONE_WITH_A_JOINT)
 def test_elements_that_refer_to_a_fixed_joint_are_removed(tmp_path: Path, case: str) -> None:
     wrist = '<body name="link"><joint name="wrist"/><geom size="1"/></body>'
     model = held(tmp_path, wrist, GONE_WITH_A_JOINT[case])
-    found = {
-        name: int(getattr(model, name)) for name in ("njnt", "neq", "ntendon", "nu", "nsensor")
-    }
-    assert found == dict.fromkeys(found, 0) | {"njnt": 1}
+    assert_has_one_joint(model, *COUNTS)
     assert model.body("link").id > 0
 
 

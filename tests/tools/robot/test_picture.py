@@ -12,13 +12,7 @@ from PIL import Image
 
 from rack.boards.config import load
 from rack.levels.robot.cell import Cell, build_cell
-from rack.tools.robot.picture import (
-    HEIGHT,
-    NO_PICTURE,
-    WIDTH,
-    build_camera,
-    draw_arm,
-)
+from rack.tools.robot.picture import HEIGHT, NO_PICTURE, WIDTH, build_camera, draw_arm
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 ARMS = ["nasrem", "k1607", "penn", "hic", CONFIGS / "examples/own-arm/desk-arm.toml"]

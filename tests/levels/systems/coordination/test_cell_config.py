@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError
 
@@ -46,61 +47,62 @@ do = [{ arm = "puma", do = "home", by = 30.0 }]
 """
 
 
-def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
-    """Return all mistakes of the rack after these changes of its text, as `rack check` reports
-    them."""
-    text = RACK
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "cell.toml").write_text(text)
-    with pytest.raises(ConfigError) as caught:
-        resolve(load(folder / "cell.toml"))
-    return str(caught.value)
+ARMS, SECOND, LAST = "board.task.params.arms", "task.step[0].do[1]", "task.step[1].do"
+HOME, LONG = 'do = "home", by = 30.0', "a part whose name is longer than 32"
+TRANSFER = f'do = "transfer", object = "{LONG}", to = [0, 0, 0]'
+TWICE, EARLIER = "this arm already has an action in this step", "the time of an earlier step"
+TOO_LONG = "an order can contain at most 32 ASCII characters"
 
 
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
+        (', k1607 = "lan.k1607" }', " }", f"{ARMS} = \"puma\": lacks 'k1607', the arm of {SECOND}"),
+        ('arm = "k1607"', 'arm = "puma"', f'{SECOND}.arm = "puma": {TWICE}'),
+        ("by = 30.0", "by = 20.0", f"{LAST}[0].by = 20.0: must be later than 20, {EARLIER}"),
         (
-            ', k1607 = "lan.k1607" }',
-            " }",
-            "board.task.params.arms = \"puma\": lacks 'k1607', the arm of task.step[0].do[1]",
-        ),
-        (
-            'arm = "k1607"',
-            'arm = "puma"',
-            ('task.step[0].do[1].arm = "puma": this arm already has an action in this step'),
-        ),
-        (
-            "by = 30.0",
-            "by = 20.0",
-            "task.step[1].do[0].by = 20.0: must be later than 20, the time of an earlier step",
-        ),
-        (
-            '[{ arm = "puma", do = "home", by = 30.0 }]',
+            f'[{{ arm = "puma", {HOME} }}]',
             "[]",
-            "task.step[1].do = []: a step must have at least one action",
+            f"{LAST} = []: a step must have at least one action",
         ),
-        (
-            'do = "home", by = 30.0',
-            'do = "fly"',
-            'task.step[1].do[0].do = "fly": valid values: transfer, goto, home',
-        ),
-        ('arm = "k1607", ', "", "task.step[0].do[1].arm: missing; arm that does it"),
+        (HOME, 'do = "fly"', f'{LAST}[0].do = "fly": valid values: transfer, goto, home'),
+        ('arm = "k1607", ', "", f"{SECOND}.arm: missing; arm that does it"),
         ("lan.k1607", "lan.other", "lan.other"),
-        (
-            'do = "home", by = 30.0',
-            'do = "transfer", object = "a part whose name is longer than 32", to = [0, 0, 0]',
-            (
-                'task.step[1].do[0].object = "a part whose name is longer than 32": an order'
-                " can contain at most 32 ASCII characters"
-            ),
-        ),
+        (HOME, TRANSFER, f'{LAST}[0].object = "{LONG}": {TOO_LONG}'),
     ],
 )
-def test_each_mistake_in_a_coordinators_config_is_one_line(
-    tmp_path: Path, old: str, new: str, line: str
-) -> None:
-    (found,) = mistakes(tmp_path, (old, new)).splitlines()
+def test_each_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
+    assert old in RACK
+    (tmp_path / "cell.toml").write_text(RACK.replace(old, new))
+    with pytest.raises(ConfigError) as caught:
+        resolve(load(tmp_path / "cell.toml"))
+    (found,) = str(caught.value).splitlines()
     assert line in found
+
+
+ORDERED = (
+    "clock.mode=lockstep",
+    "board.task.rate_hz=4",
+    "board.task.within_cycles=4",
+    "board.task.executor=rack.levels.systems.coordination:OrderedTaskExecutor",
+    "board.task.planner=rack.levels.systems.coordination:OrderedTaskPlanner",
+    "board.task.params={orders='cell.order_puma', decision=2.0}",
+    "board.task.ends_run=false",
+    (
+        "board.cell={slot=9, rate_hz=4, executor='rack.levels.systems.coordination:Coordinator',"
+        " ends_run=true}"
+    ),
+    "board.cell.params={arms={puma='task.report'}}",
+    "fault=[{kind='kill', board='cell', at=2.5}, {kind='kill', board='task', at=4.5}]",
+)
+BY = 9.0
+REACH = {"arm": "puma", "do": "goto", "position": [0.45, 0.10, 0.95], "by": BY}
+
+
+@pytest.mark.slow
+def test_order_is_done_in_time_whichever_board_is_killed(rack_name: str) -> None:
+    config = load("nasrem", [f"name={rack_name}", *ORDERED])
+    with Rack(config.model_copy(update={"task": {"step": [{"do": [REACH]}]}})) as rack:
+        outcome = rack.run()
+    assert (outcome.cause, outcome.faults) == ("task done", ())
+    assert outcome.ticks * 2.5e-3 < BY + 2.0

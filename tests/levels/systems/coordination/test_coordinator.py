@@ -14,14 +14,8 @@ from tests.levels.lockstep import BoardSpec, Lockstep, Operator
 
 EVERY = 100
 ARMS = {"puma": "lan.puma", "k1607": "lan.k1607"}
-TRANSFER = {
-    "arm": "puma",
-    "do": "transfer",
-    "object": "part",
-    "to": [0.5, 0.3, 0.475],
-    "yaw": 0.5,
-    "by": 20.0,
-}
+PLACE = {"object": "part", "to": [0.5, 0.3, 0.475], "yaw": 0.5}
+TRANSFER = {"arm": "puma", "do": "transfer", **PLACE, "by": 20.0}
 REACH = {"arm": "k1607", "do": "goto", "position": [0.8, 0.5, 0.2], "by": 15.0}
 BENT = {"arm": "k1607", "do": "goto", "joints": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]}
 AWAY = {"arm": "puma", "do": "home"}
@@ -33,9 +27,8 @@ class CellBench(Lockstep):
     def __init__(self, *steps: list[dict[str, Any]], **params: Any) -> None:
         board = BoardSpec("cell", EVERY, Coordinator, params={"arms": ARMS, **params})
         task = {"step": [{"do": step} for step in steps]}
-        super().__init__(
-            [board], *config("puma560"), task, outside=dict.fromkeys(ARMS.values(), CellReport)
-        )
+        outside = dict.fromkeys(ARMS.values(), CellReport)
+        super().__init__([board], *config("puma560"), task, outside=outside)
         self.checksum = CellProgram.model_validate(task).checksum
 
     def cycles(self, count: int = 1) -> None:
@@ -46,12 +39,8 @@ class CellBench(Lockstep):
     def say(self, arm: str, response: Response = Response.NONE, **said: Any) -> None:
         """Have an arm answer the order that it is given, or only report."""
         report, order = self.message(ARMS[arm]), self.order(arm)
-        report.echo, report.program, report.response, report.state = (
-            order.id,
-            order.program,
-            response,
-            State.EXECUTING,
-        )
+        report.echo, report.program, report.response = order.id, order.program, response
+        report.state = State.EXECUTING
         for name, value in said.items():
             setattr(report, name, value)
         self.write(ARMS[arm], report)
@@ -132,20 +121,13 @@ def test_refusal_of_one_arm_ends_the_program_for_all_with_its_reason() -> None:
     bench = CellBench([TRANSFER, REACH])
     bench.both(Response.NONE)
     bench.say("puma", Response.POSSIBLE)
-    bench.say(
-        "k1607",
-        Response.REFUSED,
-        error=Error.UNREACHABLE,
-        reason="out of reach: [0.800, 0.500, 0.200]",
-    )
+    why = "out of reach: [0.800, 0.500, 0.200]"
+    bench.say("k1607", Response.REFUSED, error=Error.UNREACHABLE, reason=why)
     bench.cycles(2)
-    reason = "step 0 refused: k1607: out of reach: [0.800, 0.500, 0.200]"
+    reason = f"step 0 refused: k1607: {why}"
     assert bench.verbs() == (OrderVerb.END, OrderVerb.END)
-    assert (bench.order("puma").reason, bench.status.reason, bench.status.state) == (
-        reason,
-        reason,
-        State.HOLDING,
-    )
+    assert bench.order("puma").reason == bench.status.reason == reason
+    assert bench.status.state == State.HOLDING
     bench.both(Response.ENDED)
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.UNREACHABLE)
     assert bench.status.reason == reason
@@ -159,11 +141,8 @@ def test_arm_that_is_lost_holds_the_others_and_the_program() -> None:
     bench.cycles(2)
     why = "k1607 is lost: the program waits until it is back"
     assert (bench.status.state, bench.status.reason) == (State.HOLDING, why)
-    assert (bench.order("puma").what, bench.order("puma").hold, bench.order("puma").reason) == (
-        OrderVerb.DO,
-        1,
-        why,
-    )
+    order = bench.order("puma")
+    assert (order.what, order.hold, order.reason) == (OrderVerb.DO, 1, why)
     bench.boxes["lan.k1607"].lost = False
     bench.cycles(2)
     assert (bench.order("puma").hold, bench.status.state) == (0, State.EXECUTING)

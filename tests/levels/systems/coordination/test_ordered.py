@@ -1,5 +1,4 @@
-"""An ordered task level alone: the test gives its orders, and plays the level below and the
-world."""
+"""An ordered task level alone: the test gives orders, and plays the level below and the world."""
 
 from __future__ import annotations
 
@@ -25,6 +24,7 @@ MOVE_CYCLES = 25
 """Cycles that the level below needs for a move."""
 TRANSFER = Transfer(object="block1", to=(0.50, -0.20, 0.475))
 HOME = Home()
+Action = Transfer | Goto | Home
 
 
 class PlayedMoves(Executor):
@@ -52,41 +52,29 @@ class PlayedMoves(Executor):
 
 
 class OrderBench(Lockstep):
-    """The task level of an arm; orders come from the rack `cell`, whose time is `ahead` of the
-    arm's."""
+    """The task level of an arm; orders come from the rack `cell`, whose time is `ahead`."""
 
-    def __init__(self, ahead: float = 0.0, uncertainty: float = 0.0, **params: Any) -> None:
+    def __init__(self, ahead: float = 0.0, **params: Any) -> None:
         outside = {
             "lan.orders": CellOrder,
             "lan.peer_cell": PeerPresence,
             "servo.status": ServoStatus,
+            "world.model": WorldState,
         }
-        table = {"coordinator": "cell", **params}
+        kinds, table = (OrderedTaskExecutor, OrderedTaskPlanner), {"coordinator": "cell", **params}
         boards = [
-            BoardSpec(
-                "task",
-                EVERY,
-                OrderedTaskExecutor,
-                OrderedTaskPlanner,
-                4,
-                below="elemental_move",
-                params=table,
-            ),
+            BoardSpec("task", EVERY, *kinds, 4, below="elemental_move", params=table),
             BoardSpec("elemental_move", MOVE_EVERY, PlayedMoves, above="task"),
         ]
-        super().__init__(boards, ROBOT, SCENE, outside={**outside, "world.model": WorldState})
+        super().__init__(boards, ROBOT, SCENE, outside=outside)
         servo = self.message("servo.status")
         servo.target = np.array(ROBOT.home)
         self.write("servo.status", servo)
-        self.compare(ahead, uncertainty)
+        peer = self.message("lan.peer_cell")
+        peer.ahead = ahead
+        self.write("lan.peer_cell", peer)
         self.revision = 0
         self.see()
-
-    def compare(self, ahead: float, uncertainty: float) -> None:
-        """Say what is known of the other rack's time."""
-        peer = self.message("lan.peer_cell")
-        peer.ahead, peer.uncertainty = ahead, uncertainty
-        self.write("lan.peer_cell", peer)
 
     def see(self) -> None:
         """Show the world, with a new revision."""
@@ -98,11 +86,7 @@ class OrderBench(Lockstep):
         self.write("world.model", world)
 
     def order(
-        self,
-        what: OrderVerb,
-        action: Transfer | Goto | Home = HOME,
-        number: int = 1000,
-        **said: Any,
+        self, what: OrderVerb, action: Action = HOME, number: int = 1000, **said: Any
     ) -> None:
         order = self.message("lan.orders")
         write_action(action, order)
@@ -112,17 +96,15 @@ class OrderBench(Lockstep):
         self.write("lan.orders", order)
 
     def lose_orders(self, is_lost: bool) -> None:
-        """Lose the rack that gives the orders, or have it back."""
         self.boxes["lan.orders"].lost = is_lost
 
     def until(self, *responses: Response, seconds: float = 20.0) -> Message:
         """Run until the report says one of these; return it."""
-        assert self.run(seconds, lambda rack: rack.read("task.report").response in responses), (
-            self.report
-        )
+        found = self.run(seconds, lambda rack: rack.read("task.report").response in responses)
+        assert found, self.report
         return self.report
 
-    def ask_and_do(self, action: Transfer | Goto | Home, number: int = 1000) -> None:
+    def ask_and_do(self, action: Action, number: int = 1000) -> None:
         self.order(OrderVerb.ASK, action, number)
         self.until(Response.POSSIBLE)
         self.order(OrderVerb.DO, action, number)
@@ -139,11 +121,8 @@ class OrderBench(Lockstep):
     def verb(self) -> Verb:
         command, current = self.read("task.command"), self.read("elemental_move.status").current
         shown = command.moves[: command.count]
-        return (
-            Verb(int(shown["verb"][shown["id"] == current][0]))
-            if current in shown["id"]
-            else Verb.NONE
-        )
+        verbs = shown["verb"][shown["id"] == current]
+        return Verb(int(verbs[0])) if len(verbs) else Verb.NONE
 
 
 def test_times_refer_to_the_clock_of_the_coordinators_rack() -> None:
@@ -161,18 +140,16 @@ def test_times_refer_to_the_clock_of_the_coordinators_rack() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changes", "stray_rad", "plans"),
+    ("changes", "stray", "plans"),
     [(False, 0.0, 1), (True, 0.0, 2), (False, 0.004, 1), (False, 0.006, 2)],
 )
-def test_promised_plan_is_renewed_only_if_the_world_or_the_arm_has_changed(
-    changes: bool, stray_rad: float, plans: int
-) -> None:
+def test_promised_plan_is_renewed_after_a_change(changes: bool, stray: float, plans: int) -> None:
     bench = OrderBench()
     bench.order(OrderVerb.ASK, TRANSFER)
     bench.until(Response.POSSIBLE)
     if changes:
         bench.see()
-    bench.tasks["elemental_move"].level.stray_rad = stray_rad
+    bench.tasks["elemental_move"].level.stray_rad = stray
     bench.run(0.1)
     bench.order(OrderVerb.DO, TRANSFER)
     assert bench.until(Response.DONE).moves_done == 8

@@ -1,9 +1,8 @@
-"""Two racks whose arms share a body: each has a copy of it, and the arm that touches it last moves
-it in both."""
+"""Two racks whose arms share a body: the arm that touches it last moves it in both."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
@@ -54,8 +53,7 @@ MOVE_S = 0.5
 
 
 class Hoist(ServoRig):
-    """One rack: a hand that goes up and down, and a part on the table between its fingers, a little
-    off the middle."""
+    """One rack: a hand that goes up and down, and a part between its fingers, off the middle."""
 
     executor = SharingServoExecutor
     outside = {"primitive.command": JointCommand, "lan.shared": SharedBodies}
@@ -64,19 +62,10 @@ class Hoist(ServoRig):
         model = folder / "hoist.xml"
         model.write_text(HOIST)
         gripper = GripperConfig(actuator="grip", joint="left", open=OPEN, closed=CLOSED, force=40.0)
-        robot = RobotConfig(
-            model=model,
-            joints=("lift",),
-            tool="tool",
-            home=(AWAY_M,),
-            velocity=(2.0,),
-            acceleration=(20.0,),
-            jerk=(200.0,),
-            gripper=gripper,
-        )
-        super().__init__(
-            robot, SceneConfig(objects=("part",), supports=("table",)), name, shared=("part",)
-        )
+        limits = {"velocity": (2.0,), "acceleration": (20.0,), "jerk": (200.0,)}
+        arm = {"model": model, "joints": ("lift",), "tool": "tool", "home": (AWAY_M,)}
+        robot, scene = RobotConfig(**arm, **limits, gripper=gripper), {"supports": ("table",)}
+        super().__init__(robot, SceneConfig(objects=("part",), **scene), name, shared=("part",))
         self.course = Course(np.array([AWAY_M]), np.array([AWAY_M]), 1.0)
         self.begun = 0
 
@@ -85,10 +74,8 @@ class Hoist(ServoRig):
 
     def go(self, height: float) -> None:
         """Move the hand to a height, m, within `MOVE_S`."""
-        self.course, self.begun = (
-            Course(self.course.goal, np.array([height]), MOVE_S),
-            self.rack.tick,
-        )
+        self.course = Course(self.course.goal, np.array([height]), MOVE_S)
+        self.begun = self.rack.tick
 
     def tick(self) -> None:
         began = self.begun * 2.5e-3
@@ -112,8 +99,7 @@ class Hoist(ServoRig):
 
 
 class Pair:
-    """Two racks that step together and read each other's messages one exchange, 20 ms, later;
-    unless `apart`."""
+    """Two racks that read each other's messages one exchange, 20 ms, later; unless `apart`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -157,18 +143,15 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
     pair.run(0.1)
     yield pair
     for hoist in (pair.alpha, pair.beta):
-        assert hoist.status.touches == hoist.status.violations == 0, (
-            "nothing was struck, no limit broken"
-        )
+        assert hoist.status.touches == hoist.status.violations == 0
 
 
 @pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
     np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
-    for number, (hoist, other) in enumerate(
-        [(pair.alpha, pair.beta), (pair.beta, pair.alpha)], start=1
-    ):
+    turns = (pair.alpha, pair.beta), (pair.beta, pair.alpha)
+    for number, (hoist, other) in enumerate(turns, start=1):
         pair.lift(hoist)
         assert hoist.claim == other.claim == Claim(number, hoist.servo.context.rack.encode())
         assert hoist.part[2] == pytest.approx(0.025 + UP_M, abs=0.003)
@@ -178,9 +161,8 @@ def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
         np.testing.assert_allclose(other.part, hoist.part, atol=1e-4)
     differing = [(a, b) for a, b in pair.claims if a != b]
     assert len(differing) <= 2 * 2 * PERIOD, "after two exchanges both know"
-    assert all(abs(a.number - b.number) == 1 for a, b in differing), (
-        "and until then one claim is the greater"
-    )
+    # Until then one claim is the greater.
+    assert all(abs(a.number - b.number) == 1 for a, b in differing)
 
 
 def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair) -> None:
@@ -196,14 +178,10 @@ def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
-)
-def test_the_part_stays_in_place_during_a_restart_of_a_servo_board(
-    pair: Pair, restarted: Callable[[Pair], Hoist]
-) -> None:
+@pytest.mark.parametrize("restarted", ["alpha", "beta"])
+def test_the_part_stays_in_place_during_a_restart(pair: Pair, restarted: str) -> None:
     pair.lift(pair.alpha)
-    hoist = restarted(pair)
+    hoist: Hoist = getattr(pair, restarted)
     before = hoist.part
     pair.apart = hoist is pair.beta  # without the other's word it has to remember by itself
     pair.run(0.1)
@@ -218,11 +196,11 @@ def test_the_part_stays_in_place_during_a_restart_of_a_servo_board(
     assert pair.alpha.claim == pair.beta.claim == Claim(2, b"beta")
 
 
-def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
+def word(rack: bytes, claim: Claim, x: float) -> Message:
     """Return a message of a rack: the claim that it knows, and where its copy is."""
     message = SharedBodies.zeros({})
     message.rack = rack
-    speaker = SharedBody(name, rack, claim)
+    speaker = SharedBody(b"part", rack, claim)
     speaker.write_entry(message.bodies[0], np.array([x, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
     return message
 
@@ -230,9 +208,8 @@ def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
 def test_only_the_owner_reports_the_pose_of_a_body() -> None:
     body = SharedBody(b"part", b"alpha")
     owned = Claim(3, b"beta")
-    assert body.process_message(word(b"gamma", owned, 1.0)) is not None, (
-        "the claim is news, from wherever"
-    )
+    # The claim is news, from wherever.
+    assert body.process_message(word(b"gamma", owned, 1.0)) is not None
     assert body.claim == owned
     assert body.process_message(word(b"gamma", owned, 2.0)) is None, "its copy is late"
     told = body.process_message(word(b"beta", owned, 3.0))

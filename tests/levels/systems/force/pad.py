@@ -32,6 +32,7 @@ SENSORS = """
   <torque name="wrist_torque" site="{torque}" cutoff="20"/>
 </sensor>
 """
+GRIP = '<motor name="grip" joint="finger_left" ctrlrange="-60 60"/>'
 WRIST = {"force": "wrist_force", "torque": "wrist_torque", "most_force": 60.0, "most_torque": 8.0}
 
 
@@ -49,30 +50,21 @@ def pad(
     `resolution` is that of the encoders, rad; `reach` the range of the sensor, N.
     """
     before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
-    after = rest.split("</body>", 3)[3].replace(
-        '<exclude body1="finger_left" body2="finger_right"/>', ""
-    )
-    after = after.replace('body2="hand"', 'body2="tool"').replace(
-        "</worldbody>", WORLD + "</worldbody>"
-    )
+    after = rest.split("</body>", 3)[3].replace('body2="hand"', 'body2="tool"')
+    for gone in ('<exclude body1="finger_left" body2="finger_right"/>', GRIP):
+        after = after.replace(gone, "")
+    after = after.replace("</worldbody>", WORLD + "</worldbody>")
     equality, actuator = after.index("<equality>"), after.index("<actuator>")
-    after = (
-        after[:equality]
-        + SENSORS.format(force=sites[0], torque=sites[1], range=reach)
-        + after[actuator:]
-    )
-    after = after.replace('<motor name="grip" joint="finger_left" ctrlrange="-60 60"/>', "")
-    text = (
-        (before + PAD + after).replace("{contact}", contact).replace("{friction}", f"{friction:g}")
-    )
-    model = folder / "pad.xml"
-    model.write_text(text)
+    sensors = SENSORS.format(force=sites[0], torque=sites[1], range=reach)
+    after = after[:equality] + sensors + after[actuator:]
+    body = PAD.format(contact=contact, friction=f"{friction:g}")
+    (folder / "pad.xml").write_text(before + body + after)
     robot, _ = config("puma560")
     changes = {
-        "model": model,
+        "model": folder / "pad.xml",
         "gripper": None,
         "substeps": 4,
         "wrist": WristConfig(**{**WRIST, **wrist}),
+        "sensors": SensorConfig(resolution=resolution),
     }
-    changes["sensors"] = SensorConfig(resolution=resolution)
     return robot.model_copy(update=changes), SceneConfig(supports=("table", "wall"))

@@ -20,7 +20,7 @@ from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.joint_boards import JointServo
 from rack.levels.systems.joint_boards.messages import JointReference
 from tests.levels.lockstep import BoardSpec, Lockstep
-from tests.levels.servo.rig import Found
+from tests.levels.servo.rig import BRAKES, ArmRig
 from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000
@@ -32,40 +32,32 @@ FREE_M, WALL_M = 0.74, 0.76
 """x of the tool in front of the wall, and with the pad touching it."""
 
 
-class PressRig:
-    """An arm board and a board that servoes its joints, under references for the tool, forwards and
-    backwards."""
+class PressRig(ArmRig):
+    """An arm board and one that servoes its joints, under references for the tool, to and fro."""
 
-    def __init__(
-        self, folder: Path, reach: float = 150.0, resolution: float = 0.0, **arm: Any
-    ) -> None:
+    board = "arm"
+
+    def __init__(self, folder: Path, reach: float = 150, resolution: float = 0, **arm: Any) -> None:
         robot, scene = pad(folder, reach=reach, resolution=resolution)
         boards = [
             BoardSpec("arm", 1, ForceArmExecutor, above="servo", params=arm),
             BoardSpec("servo", 1, JointServo, above="level", below="arm"),
         ]
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
-        self._near = ik.find_free_solutions(
-            make_pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True
-        )[0]
+        pose = make_pose((FREE_M, 0.0, 0.75), FORWARD)
+        self._near = ik.find_free_solutions(pose, np.array(robot.home), lambda q: True)[0]
         robot = robot.model_copy(update={"home": tuple(self._near)})
         cell = build_cell(robot, scene, CLOCK_NS)
-        self.rack = Lockstep(
-            boards, robot, scene, outside={"level.command": JointReference}, clock_ns=CLOCK_NS
-        )
+        outside = {"level.command": JointReference}
+        super().__init__(Lockstep(boards, robot, scene, outside=outside, clock_ns=CLOCK_NS))
         self._ik, self._dynamics, self.x = ik, Dynamics(cell), FREE_M
         self.command = self.rack.message("level.command")
-        self.found: list[Found] = []
         self.forces: list[float] = []
         self.braked: list[bool] = []
 
     @property
     def arm(self) -> ForceArmExecutor:
-        return cast(ForceArmExecutor, self.rack.tasks["arm"].level)
-
-    @property
-    def status(self) -> Message:
-        return cast(Message, self.rack.tasks["arm"].written["status"])
+        return cast(ForceArmExecutor, self.level)
 
     @property
     def wrench(self) -> Message:
@@ -78,10 +70,8 @@ class PressRig:
             speed, before = (x - self.x) / seconds, self._near
             self._near = self._ik.find_nearby(make_pose((to, 0.0, 0.75), FORWARD), before)
             assert self._near is not None
-            still = to == x
-            velocity = (
-                np.zeros(6) if still or speed == 0.0 else (self._near - before) / (PERIOD * 1e-3)
-            )
+            is_still = to == x or speed == 0.0
+            velocity = np.zeros(6) if is_still else (self._near - before) / (PERIOD * 1e-3)
             terms = self._dynamics.terms(self._near, velocity)
             command, self.command.due = self.command, self.rack.tick + 2 * PERIOD
             command.id += 1
@@ -93,17 +83,9 @@ class PressRig:
 
     def run(self, ticks: int) -> None:
         for _ in range(ticks):
-            arm = self.arm
-            self.rack.step()
-            self.found += [Found(self.rack.tick - 1, finding) for finding in arm.findings]
-            arm.findings.clear()
+            self.step()
             self.forces.append(norm(self.wrench.wrench[:3]))
             self.braked.append(bool(self.status.braked))
-
-    def alarms(self) -> list[Alarm]:
-        """Return the alarms, except alarms of the brakes."""
-        brakes = Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED
-        return [finding.alarm for _, finding in self.found if finding.alarm not in brakes]
 
 
 def pressed(folder: Path, depth: float, seconds: float = 0.4, **arm: Any) -> PressRig:
@@ -120,7 +102,7 @@ def test_a_contact_within_the_limits_is_measured_and_is_not_a_fault(tmp_path: Pa
     force = rig.wrench.wrench[:3]
     assert -60.0 < force[0] < -10.0
     assert np.abs(force[1:]).max() < 0.4 * abs(force[0])  # friction
-    assert (rig.alarms(), rig.status.reason, any(rig.braked[100:])) == ([], "", False)
+    assert (rig.alarms(*BRAKES), rig.status.reason, any(rig.braked[100:])) == ([], "", False)
     assert (rig.wrench.exceeded, rig.wrench.saturated, rig.status.touches) == (0, 0, 0)
 
 
@@ -134,18 +116,14 @@ def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: floa
     rig.arm.arm.sense_wrist = lambda: np.array([150.0, 0, 0, 0, 0, 0])  # type: ignore[method-assign]
     rig.run(1)
     assert rig.wrench.saturated
-    assert rig.alarms() == [Alarm.FORCE_LIMIT]
+    assert rig.alarms(*BRAKES) == [Alarm.FORCE_LIMIT]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("on_force_limit", "is_braked"), [("brake", True), ("stop", True), ("hold", False)]
-)
-def test_a_contact_beyond_the_limit_stops_the_arm(
-    tmp_path: Path, on_force_limit: str, is_braked: bool
-) -> None:
-    rig = pressed(tmp_path, 0.01, seconds=1.0, retry=2.0, on_force_limit=on_force_limit)
-    assert rig.alarms() == [Alarm.FORCE_LIMIT]
+@pytest.mark.parametrize(("reaction", "is_braked"), [("brake", 1), ("stop", 1), ("hold", 0)])
+def test_too_strong_a_contact_stops_the_arm(tmp_path: Path, reaction: str, is_braked: bool) -> None:
+    rig = pressed(tmp_path, 0.01, seconds=1.0, retry=2.0, on_force_limit=reaction)
+    assert rig.alarms(*BRAKES) == [Alarm.FORCE_LIMIT]
     found = next(found for found in rig.found if found.finding.alarm is Alarm.FORCE_LIMIT)
     assert 60.0 < found.finding.value == rig.forces[found.tick] < 80.0
     assert max(rig.forces[: found.tick]) < 60.0
@@ -165,6 +143,6 @@ def test_the_arm_follows_again_when_the_contact_is_over(tmp_path: Path) -> None:
             break
     assert (rig.status.reason, rig.status.error) == ("", Error.NONE)
     latched = pressed(tmp_path, 0.02, patience=0.15)
-    assert Alarm.LATCHED in latched.alarms()
+    assert Alarm.LATCHED in latched.alarms(*BRAKES)
     assert (latched.status.state, latched.status.error) == (State.ERROR, Error.FORCE)
     assert latched.status.reason.endswith("not over within 0.15 s")

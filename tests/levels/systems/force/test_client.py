@@ -13,11 +13,10 @@ from pydantic import ValidationError
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import copy_message
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.messages import MotionKind
-from tests.levels.arms import config
+from tests.levels.arms import config, context
 
 ROBOT, SCENE = config("penn_cell")
 TASK: Mapping[str, Any] = {
@@ -27,17 +26,10 @@ TASK: Mapping[str, Any] = {
         "wall": {"frame": "table", "guard": {"x": 8.0, "ry": 0.5}},
     },
 }
-CONTEXT = LevelContext(
-    board="client",
-    every=1,
-    within_cycles=1,
-    clock_ns=1_000_000,
-    seed=1,
-    robot=ROBOT,
-    scene=SCENE,
-    task=TASK,
-    sizes={"joints": 6},
-)
+CONTEXT = context("client", (ROBOT, SCENE), task=TASK, sizes={"joints": 6})
+
+
+PERMITTED = "permitted by the arm and its sensor: "
 
 
 class Bus:
@@ -85,11 +77,8 @@ def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
     arm.guard("wall")
     arm.free()
     comply, guard, free = bus.requests
-    assert [request.kind for request in bus.requests] == [
-        MotionKind.COMPLY,
-        MotionKind.GUARD,
-        MotionKind.COMPLY,
-    ]
+    kinds = [MotionKind.COMPLY, MotionKind.GUARD, MotionKind.COMPLY]
+    assert [request.kind for request in bus.requests] == kinds
     assert comply.selected.tolist() == [0, 0, 1, 1, 0, 0]
     assert comply.wrench.tolist() == [0, 0, 20, 0, 0, 0]
     assert comply.speed.tolist() == [0, 0, 0.1, 0, 0, 0]
@@ -116,21 +105,11 @@ def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
 @pytest.mark.parametrize(
     ("call", "contact", "changes", "message"),
     [
-        (
-            "comply",
-            "wipe",
-            {"wrench": {"z": 90.0}},
-            "contact 'wipe': force 90 N; permitted by the arm and its sensor: 80",
-        ),
+        ("comply", "wipe", {"wrench": {"z": 90.0}}, f"contact 'wipe': force 90 N; {PERMITTED}80"),
         ("comply", "wall", {}, "contact 'wall' has no axis of force; free() ends compliance"),
         ("guard", "wipe", {}, "contact 'wipe' guards no axis"),
         ("guard", "wood", {}, "contact 'wood' is not in [task.contact]; valid values: wipe, wall"),
-        (
-            "guard",
-            "wall",
-            {"guard": {"ry": 9.0}},
-            "contact 'wall': torque 9 N m; permitted by the arm and its sensor: 8",
-        ),
+        ("guard", "wall", {"guard": {"ry": 9.0}}, f"contact 'wall': torque 9 N m; {PERMITTED}8"),
         ("comply", "wipe", {"wrench": {"w": 5.0}}, "wrench.w"),
         (
             "comply",
@@ -150,26 +129,20 @@ def test_an_impossible_contact_is_refused_at_once(
     assert not bus.requests
 
 
+WIPE = {"frame": "table", "wrench": {"z": 60.0, "x": -60.0}}
+
+
 @pytest.mark.parametrize(
-    ("table", "key", "reason"),
+    ("frames", "reason"),
     [
-        (
-            {"contact": {"wipe": {"frame": "table", "wrench": {"z": 81.0}}}},
-            "contact.wipe",
-            "frame 'table' is not in [task.frame]; valid values: none",
-        ),
-        (
-            {**TASK, "contact": {"wipe": {"frame": "table", "wrench": {"z": 60.0, "x": -60.0}}}},
-            "contact.wipe",
-            "force 84.8528 N; permitted by the arm and its sensor: 80",
-        ),
+        ({}, "frame 'table' is not in [task.frame]; valid values: none"),
+        (TASK["frame"], f"force 84.8528 N; {PERMITTED}80"),
     ],
 )
-def test_an_impossible_program_is_reported_before_the_launch(
-    table: Any, key: str, reason: str
-) -> None:
-    found = list(ForceProgram.model_validate(table).find_mismatches(ROBOT, SCENE))
-    assert [(place, why) for place, _, why in found] == [(key, reason)]
+def test_an_impossible_program_is_reported(frames: Any, reason: str) -> None:
+    program = ForceProgram.model_validate({"frame": frames, "contact": {"wipe": WIPE}})
+    found = list(program.find_mismatches(ROBOT, SCENE))
+    assert [(place, why) for place, _, why in found] == [("contact.wipe", reason)]
 
 
 @pytest.mark.parametrize(

@@ -49,15 +49,11 @@ def place(cell: Cell, q: Array) -> Array:
     return tool.pose.position
 
 
-def test_the_inverse_gives_the_wanted_velocity_and_is_finite_at_a_singularity(
-    cell: Cell,
-) -> None:
+def test_the_inverse_gives_the_velocity_even_at_a_singularity(cell: Cell) -> None:
     tool, twist = ToolKinematics(cell), np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1])
     tool.evaluate_at(cell.home, np.zeros(6))
-    assert (
-        np.abs(tool.jacobian @ solve_damped(tool.jacobian, twist) - twist).max()
-        < 0.01 * np.abs(twist).max()
-    )
+    missed = np.abs(tool.jacobian @ solve_damped(tool.jacobian, twist) - twist)
+    assert missed.max() < 0.01 * np.abs(twist).max()
     straight = cell.home.copy()
     straight[4] = 0.0  # joints 4 and 6 turn about one axis
     tool.evaluate_at(straight, np.zeros(6))
@@ -97,10 +93,9 @@ def test_every_joint_keeps_its_acceleration(cell: Cell) -> None:
     for cycle in range(60):
         wanted = task(np.zeros(6)) if cycle < 30 else None
         command = law.step(resting(cell), wanted, PERIOD_S, EMPTY)
-        assert (
-            np.abs(command.velocity - before) <= 1.001 * cell.limits.acceleration * PERIOD_S
-        ).all()
-        assert command.acceleration == pytest.approx((command.velocity - before) / PERIOD_S)
+        change = command.velocity - before
+        assert (np.abs(change) <= 1.001 * cell.limits.acceleration * PERIOD_S).all()
+        assert command.acceleration == pytest.approx(change / PERIOD_S)
         before = command.velocity
     assert law.is_at_rest
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rack.backplane.message import Message
@@ -11,7 +9,6 @@ from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HandStatus, TensionCommand
-from rack.levels.tables import PushConfig
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
 
@@ -36,11 +33,9 @@ class Swing(Executor):
         assert hand is not None
         self.hand = hand
         finger = context.params.get("finger")
-        self.driven = (
-            np.ones(len(hand.arms), bool)
-            if finger is None
-            else hand.fingers[hand.names.index(finger)]
-        )
+        everything = np.ones(len(hand.arms), bool)
+        names = hand.names
+        self.driven = everything if finger is None else hand.fingers[names.index(finger)]
         self.is_blind = False  # it takes no new status
         self.override: float | None = None  # N: commanded of all tendons instead
 
@@ -49,37 +44,27 @@ class Swing(Executor):
         if not self.below.has_message or self.is_blind:
             command.sampled = -1 if not self.below.has_message else command.sampled
             return
-        wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(
-            RATE * tick * self.context.tick_s
-        )
+        swing = AMPLITUDE_RAD * np.sin(RATE * tick * self.context.tick_s)
+        wanted = np.array(self.context.robot.home) + swing
         torque = STIFFNESS * (wanted - status.position) - DAMPING * status.velocity
         tension = np.zeros((2, len(torque)))
-        tension[FLEXOR], tension[EXTENSOR] = (
-            hand.rest + torque / (2 * hand.arms),
-            hand.rest - torque / (2 * hand.arms),
-        )
-        command.tension = (
-            np.clip(tension, hand.least, hand.most) if self.override is None else self.override
-        )
+        half = torque / (2 * hand.arms)
+        tension[FLEXOR], tension[EXTENSOR] = hand.rest + half, hand.rest - half
+        within = np.clip(tension, hand.least, hand.most)
+        command.tension = within if self.override is None else self.override
         command.driven, command.sampled = self.driven, status.tick
 
 
 class HandRig(Lockstep):
     """A hand and the boards that swing its fingers: one for each of `fingers`, or one for all."""
 
-    def __init__(self, fingers: tuple[str, ...] = (), pushes: tuple[PushConfig, ...] = ()) -> None:
+    def __init__(self, fingers: tuple[str, ...] = ()) -> None:
         robot, scene = config("utah_mit")
         above = tuple(fingers) or ("all",)
-        params: dict[str, dict[str, Any]] = {
-            name: {"finger": name} if fingers else {} for name in above
-        }
+        finger = {name: {"finger": name} if fingers else {} for name in above}
         boards = [BoardSpec("hand", EVERY, HandExecutor, above=above)]
-        boards += [
-            BoardSpec(name, EVERY, Swing, below="hand", params=params[name]) for name in above
-        ]
-        super().__init__(
-            boards, robot, scene.model_copy(update={"push": pushes}), clock_ns=CLOCK_NS
-        )
+        boards += [BoardSpec(n, EVERY, Swing, below="hand", params=finger[n]) for n in above]
+        super().__init__(boards, robot, scene, clock_ns=CLOCK_NS)
 
     @property
     def executor(self) -> HandExecutor:

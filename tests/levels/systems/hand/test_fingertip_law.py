@@ -29,10 +29,7 @@ class Tips:
     def __init__(self) -> None:
         self.law = FingertipLaw(the_kinematics(), range(4), FingertipGains(), PERIOD_S)
         self.law.start(BENT)
-        self.grasp, self.target = (
-            GraspTarget.zeros(SIZES),
-            FingerTarget.zeros(SIZES),
-        )
+        self.grasp, self.target = GraspTarget.zeros(SIZES), FingerTarget.zeros(SIZES)
         self.grasp.position = BENT
 
     def run(self, cycles: int, sensed: Array | None = None) -> Array:
@@ -52,9 +49,8 @@ def test_the_jacobian_is_the_derivative_of_the_tip() -> None:
             moved = BENT.copy()
             moved[joint] += step
             kinematics.set_position(moved)
-            assert (kinematics.find_tip(finger) - tip) / step == pytest.approx(
-                jacobian[:, column], abs=1e-5
-            )
+            change = (kinematics.find_tip(finger) - tip) / step
+            assert change == pytest.approx(jacobian[:, column], abs=1e-5)
 
 
 def test_a_tip_comes_to_its_point_evenly_and_other_fingers_keep_their_posture() -> None:

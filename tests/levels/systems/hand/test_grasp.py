@@ -1,20 +1,101 @@
-"""A grasp by all loops of a hand: it takes an object, keeps it and releases it.
-
-It keeps the object while the object is pulled and boards die.
-"""
+"""A grasp by all loops of a hand keeps its object while the object is pulled and boards die."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 
-from rack.backplane.message import State
-from rack.levels.messages import Error
+from rack.backplane.message import Message, State
+from rack.levels.level import Input
+from rack.levels.messages import Error, Scene
+from rack.levels.systems.hand import (
+    FingerExecutor,
+    FingertipLoop,
+    GraspExecutor,
+    HandExecutor,
+    JointLoop,
+    TendonLoop,
+)
 from rack.levels.systems.hand.grasp_program import GraspProgram
 from rack.levels.tables import PushConfig
+from rack.levels.world import WorldModel
 from tests.levels.arms import config
-from tests.levels.systems.hand.grasp_rig import CLOSE, LIFT, PRESHAPE, SQUEEZE, GraspRig, program
+from tests.levels.lockstep import BoardSpec, Lockstep
+
+CLOCK_NS, EVERY = 500_000, 4
+FINGERS = ("index", "middle", "ring", "thumb")
+OPEN = {**dict.fromkeys(FINGERS, (0.0, 0.17, 0.26, 0.17)), "thumb": (0.0, 0.05, 0.17, 0.17)}
+AROUND = {**dict.fromkeys(FINGERS, (0.0, 0.60, 0.70, 0.64)), "thumb": (0.0, 0.08, 0.90, 0.96)}
+POINTS = {"index": [0.014, 0.0, 0.03], "middle": [0.014, 0.0, 0.0], "ring": [0.014, 0.0, -0.03]}
+POINTS["thumb"] = [-0.014, 0.0, 0.0]
+CLOSE: dict[str, Any] = {"do": "close", "object": "can", "points": POINTS, "speed": 0.06}
+PRESHAPE: dict[str, Any] = {"do": "preshape", "posture": "around", "seconds": 0.5}
+SQUEEZE = {"do": "squeeze", "grip": 5.0, "seconds": 0.3}
+LIFT = {"do": "shift", "by": [0.0, 0.0, 0.006], "seconds": 0.5}
+
+
+class SceneWorld(WorldModel):
+    """A world model that reads the scene of the board of the hand."""
+
+    scene = Input(Scene, "hand.scene")
+
+
+def program(*steps: Mapping[str, Any]) -> dict[str, Any]:
+    return {"posture": {"open": OPEN, "around": AROUND}, "step": list(steps)}
+
+
+class GraspRig(Lockstep):
+    """Runs a program of a grasp, with a board per loop ("loops") or per finger ("fingers")."""
+
+    def __init__(
+        self,
+        boards: str,
+        steps: Sequence[Mapping[str, Any]],
+        pushes: tuple[PushConfig, ...] = (),
+        **params: Any,
+    ) -> None:
+        robot, scene = config("utah_mit")
+        at = {"above": "grasp", "below": "hand"}
+        if boards == "loops":
+            specs = [
+                BoardSpec("hand", EVERY, HandExecutor, above="tendon"),
+                BoardSpec("tendon", EVERY, TendonLoop, above="joint", below="hand"),
+                BoardSpec("joint", EVERY, JointLoop, above="fingertip", below="tendon"),
+                BoardSpec("fingertip", 4 * EVERY, FingertipLoop, above="grasp", below="joint"),
+                BoardSpec("grasp", 20 * EVERY, GraspExecutor, below="fingertip", params=params),
+            ]
+        else:
+            specs = [
+                BoardSpec("hand", EVERY, HandExecutor, above=FINGERS),
+                *(BoardSpec(f, EVERY, FingerExecutor, **at, params={"finger": f}) for f in FINGERS),
+                BoardSpec("grasp", 5 * EVERY, GraspExecutor, below=FINGERS, params=params),
+            ]
+        specs.append(BoardSpec("world", 5 * EVERY, SceneWorld))
+        pushed = scene.model_copy(update={"push": pushes})
+        super().__init__(specs, robot, pushed, task=program(*steps), clock_ns=CLOCK_NS)
+        self.least_tension = np.inf  # N, sensed while the valves were open
+
+    @property
+    def grasp(self) -> Message:
+        return self.read("grasp.status")
+
+    def go(self, seconds: float, steps: int | None = None) -> bool:
+        """Run until the program has ended, or `steps` of it are done. Returns False on time-out."""
+
+        def ended(rack: Lockstep) -> bool:
+            hand = rack.read("hand.status")
+            if hand.state == State.EXECUTING:
+                self.least_tension = min(self.least_tension, float(hand.tension.min()))
+            status = self.grasp
+            return status.state in (State.DONE, State.ERROR) or (
+                steps is not None and status.step >= steps
+            )
+
+        return self.run(seconds, ended)
+
 
 pytestmark = pytest.mark.thorough
 
@@ -63,12 +144,9 @@ def test_a_program_that_is_kept_for_too_long_fails() -> None:
     assert status.reason.startswith("waited for 0.3 s: ")
 
 
+NAMES = ", ".join(FINGERS)
 WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
-    "finger": (
-        program() | {"opposing": "little"},
-        "opposing",
-        "no such finger; fingers: index, middle, ring, thumb",
-    ),
+    "finger": (program() | {"opposing": "little"}, "opposing", f"no such finger; fingers: {NAMES}"),
     "posture": (
         program({**PRESHAPE, "posture": "fist"}),
         "step[0].posture",
@@ -97,8 +175,5 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
 @pytest.mark.parametrize("case", WRONG)
 def test_mistakes_of_a_program_name_key_and_what_is_permitted(case: str) -> None:
     task, key, reason = WRONG[case]
-    found = {
-        key: why
-        for key, _, why in GraspProgram.model_validate(task).find_mismatches(*config("utah_mit"))
-    }
-    assert reason in found[key]
+    misfits = GraspProgram.model_validate(task).find_mismatches(*config("utah_mit"))
+    assert reason in {key: why for key, _, why in misfits}[key]

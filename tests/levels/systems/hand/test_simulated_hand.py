@@ -1,5 +1,4 @@
-"""The simulated hand: tensions behind valves, limits at every step, forces on fingertips, exact
-restarts."""
+"""The simulated hand: tensions behind valves, limits, forces on fingertips, exact restarts."""
 
 from __future__ import annotations
 
@@ -7,31 +6,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import ArmState
-from rack.levels.robot.cell import build_cell, compute_sizes
+from rack.levels.robot.cell import build_cell
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
-from tests.levels.arms import config
+from tests.levels.arms import config, save_state
 from tests.levels.systems.hand.hand_rig import CLOCK_NS, EVERY
 
 TICK_S = CLOCK_NS * 1e-9
 INDEX1 = 1
 
 
-def hand_of(stiff: float | None = None) -> SimulatedHand:
-    """Return the hand, with `stiff`, N/m, of its closed valves."""
+def build_hand() -> SimulatedHand:
     robot, scene = config("utah_mit")
-    if stiff is not None and robot.hand is not None:
-        robot = robot.model_copy(update={"hand": robot.hand.model_copy(update={"closed": stiff})})
     return SimulatedHand(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, EVERY)
-
-
-def saved(hand: SimulatedHand) -> Message:
-    state = ArmState.zeros(compute_sizes(hand.cell))
-    hand.save(state)
-    return state
 
 
 def flexed(hand: SimulatedHand, joint: int, flexor: float) -> Array:
@@ -42,7 +30,7 @@ def flexed(hand: SimulatedHand, joint: int, flexor: float) -> Array:
 
 
 def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_the_valve() -> None:
-    hand = hand_of()
+    hand = build_hand()
     before = hand.sense().tension[FLEXOR, INDEX1]
     wanted, risen = flexed(hand, INDEX1, 65.0), []
     for _ in range(40):
@@ -55,9 +43,8 @@ def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_t
     assert risen[0] == 0.0
     assert risen[-1] > 0.88
     sample = hand.sense()
-    assert sample.torque == pytest.approx(
-        hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR])
-    )
+    difference = sample.tension[FLEXOR] - sample.tension[EXTENSOR]
+    assert sample.torque == pytest.approx(hand.hand.arms * difference)
     # The valves close by themselves when no command comes.
     hand.step(2 * EVERY - 1)
     assert not hand.braked
@@ -67,7 +54,7 @@ def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_t
 
 @pytest.mark.slow
 def test_no_pull_breaks_a_limit_at_any_step() -> None:
-    hand, rng = hand_of(), np.random.default_rng(3)
+    hand, rng = build_hand(), np.random.default_rng(3)
     for _ in range(20):
         flex = rng.random(16) < 0.5
         tension = np.where([flex, ~flex], hand.hand.most, hand.hand.least)
@@ -78,15 +65,13 @@ def test_no_pull_breaks_a_limit_at_any_step() -> None:
 
 
 def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
-    hand = hand_of()
+    hand = build_hand()
     around = np.array([0.0, 0.70, 0.86, 0.75] * 3 + [0.0, 0.40, 0.72, 0.75])
     for _ in range(300):
         sample, tension = hand.sense(), np.array(hand.commanded_tensions)
         torque = 1.5 * (around - sample.position) - 0.1 * sample.velocity
-        tension[FLEXOR], tension[EXTENSOR] = (
-            20.0 + torque / (2 * hand.hand.arms),
-            20.0 - torque / (2 * hand.hand.arms),
-        )
+        half = torque / (2 * hand.hand.arms)
+        tension[FLEXOR], tension[EXTENSOR] = 20.0 + half, 20.0 - half
         hand.apply_tensions(tension.clip(hand.hand.least, hand.hand.most))
         hand.step(EVERY)
     force = hand.sense().force
@@ -116,11 +101,11 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
                 hand.apply_tensions(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
             hand.step(EVERY)
 
-    first, again, middle = hand_of(), hand_of(), ArmState.zeros(compute_sizes(hand_of().cell))
+    first, again = build_hand(), build_hand()
     run(first, range(60))
-    first.save(middle)
+    middle = save_state(first)
     run(first, range(60, 90))
     again.restore(middle)
     run(again, range(60, 90))
-    assert saved(again).raw == saved(first).raw
+    assert save_state(again).raw == save_state(first).raw
     assert all(np.array_equal(a, b) for a, b in zip(again.sense(), first.sense(), strict=True))

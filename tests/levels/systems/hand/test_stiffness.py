@@ -25,9 +25,8 @@ def test_stiffness_of_closed_valves_grows_with_pretension_as_the_spring_does(res
 
 @pytest.mark.slow
 def test_open_valves_resist_a_short_push_less_but_the_more_the_higher_the_pretension() -> None:
-    closed, soft, stiff = (
-        SCRIPT["measure_stiffness"](*case) for case in ((15.0, False), (15.0, True), (40.0, True))
-    )
+    cases = (15.0, False), (15.0, True), (40.0, True)
+    closed, soft, stiff = (SCRIPT["measure_stiffness"](*case) for case in cases)
     assert (0.4 * closed < soft).all()
     assert (soft < 0.8 * closed).all()
     # As in the ratio of the springs, 8500 to 5000 N/m.
@@ -36,9 +35,8 @@ def test_open_valves_resist_a_short_push_less_but_the_more_the_higher_the_preten
 
 def build_hand(stiffening: float) -> SimulatedHand:
     config = load("hic", [f"robot.hand.stiffening={stiffening}"])
-    return SimulatedHand(
-        build_cell(config.robot, config.scene, config.clock_ns), config.scene, config.clock_ns
-    )
+    cell = build_cell(config.robot, config.scene, config.clock_ns)
+    return SimulatedHand(cell, config.scene, config.clock_ns)
 
 
 @pytest.mark.parametrize("stiffening", [0.0, 0.0483])

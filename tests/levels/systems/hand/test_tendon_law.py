@@ -46,9 +46,8 @@ class Valves:
             self.law.set_tensions(self.status, torque, self.wanted)
             for _ in range(SUBSTEPS):
                 aim = self._gain * self.wanted + self._offset
-                self.tension += (aim - self.tension) * (
-                    1.0 - math.exp(-PERIOD_S / SUBSTEPS / LAG_S)
-                )
+                part = 1.0 - math.exp(-PERIOD_S / SUBSTEPS / LAG_S)
+                self.tension += (aim - self.tension) * part
             self.status.tension, self.status.wanted = sensed, wanted
             self.status.tick += EVERY
             self.histories.append(self.torque)
@@ -59,9 +58,7 @@ class Valves:
 
 
 @pytest.mark.parametrize("part", [0.0, 0.1, -0.1, 0.5, -0.9, 1.0, -1.0])
-def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_slack(
-    part: float,
-) -> None:
+def test_tensions_give_the_torque_and_none_is_slack(part: float) -> None:
     valves = Valves()
     hand = valves.hand
     torque = part * hand.torque
@@ -72,9 +69,8 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
     assert (valves.wanted <= hand.most + 1e-9).all()
     half = np.abs(torque) / hand.arms / 2
     easy = (hand.rest - half >= hand.least) & (hand.rest + half <= hand.most)
-    mean = np.where(
-        easy, hand.rest, np.minimum(np.maximum(hand.rest, hand.least + half), hand.most - half)
-    )
+    higher = np.minimum(np.maximum(hand.rest, hand.least + half), hand.most - half)
+    mean = np.where(easy, hand.rest, higher)
     assert (flexors + extensors) / 2 == pytest.approx(mean)
     assert valves.law.clipped == 0
 
@@ -102,9 +98,7 @@ def test_a_lead_brings_torques_earlier_without_overshoot() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "offset"), [(0.9, 0.0), (1.1, 0.0), (1.0, 1.0), (0.95, -0.8)])
-def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(
-    gain: float, offset: float
-) -> None:
+def test_lasting_errors_of_valves_are_learned(gain: float, offset: float) -> None:
     valves = Valves(gain, offset, TendonGains())
     torque = 0.1 * valves.hand.torque
     valves.run(torque, 3.0)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, copy_message
+from rack.levels.algebra import Array, mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
+from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
-from rack.levels.systems.hand.workstation import Workstation
-from tests.levels.arms import cell, config
+from rack.levels.systems.hand.workstation import GraspPlanner, GraspRules, PlannedGrasp, Workstation
+from tests.levels.arms import cell, config, context
 
 HAND = cell("utah_mit")
 START = HAND.build_start_data()
@@ -75,26 +77,9 @@ class Crate:
 
 
 def workstation(**params: Any) -> Workstation:
-    robot, scene = config("utah_mit")
-    table = {
-        "object": "can",
-        "opposing": "thumb",
-        "every_s": 1e-6,
-    }
-    context = LevelContext(
-        board="workstation",
-        every=1,
-        within_cycles=1,
-        clock_ns=500_000,
-        seed=1,
-        robot=robot,
-        scene=scene,
-        task={},
-        sizes=SIZES,
-        params={**table, **params},
-        rack="lab",
-    )
-    return Workstation(context)
+    table = {"object": "can", "opposing": "thumb", "every_s": 1e-6, **params}
+    arm, more = config("utah_mit"), {"params": table, "rack": "lab"}
+    return Workstation(context("workstation", arm, clock_ns=500_000, sizes=SIZES, **more))
 
 
 @pytest.mark.slow
@@ -130,3 +115,52 @@ def test_it_waits_until_it_knows_object_and_coordinator() -> None:
     crate.world.verdict = crate.grasp.verdict = Verdict.NONE
     host.run(crate)  # type: ignore[arg-type]
     assert not crate.plan.plans
+
+
+CAN_RADIUS_M = 0.024
+RULES = GraspRules()
+AT, UPRIGHT = START.xpos[HAND.bodies[0]].copy(), np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def planner() -> GraspPlanner:
+    return GraspPlanner(HAND, "thumb", RULES)
+
+
+@pytest.fixture(scope="module")
+def planned(planner: GraspPlanner) -> PlannedGrasp:
+    found = planner.plan(0, AT, UPRIGHT)
+    assert found is not None
+    return found
+
+
+def tips(posture: Array) -> Array:
+    """Return the tips at joint positions, (fingers, 3), m, in the palm's frame."""
+    assert HAND.hand is not None
+    kinematics = FingerKinematics(HAND, HAND.hand)
+    kinematics.set_position(posture)
+    return np.array([kinematics.find_tip(finger) for finger in range(4)])
+
+
+@pytest.mark.slow
+def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planned: PlannedGrasp) -> None:
+    found = planned
+    radii = np.sqrt((found.contact[:, :2] ** 2).sum(axis=1))
+    assert radii == pytest.approx(np.full(4, CAN_RADIUS_M))
+    assert found.normal[:3] == pytest.approx(-found.normal[[3, 3, 3]])
+    # Each pushes into the object, through its axis.
+    assert found.normal[:, :2] == pytest.approx(-found.contact[:, :2] / CAN_RADIUS_M)
+    assert 0.1 < found.margin < 0.5
+    # They close from tips that are clear of the object by as much as asked.
+    outside = AT + found.contact - RULES.clear * found.normal
+    palm = START.site_xmat[HAND.tool].reshape(3, 3).T
+    wanted = np.array([mat_vec(palm, point - START.site_xpos[HAND.tool]) for point in outside])
+    assert np.abs(tips(found.posture) - wanted).max() < 2e-3
+
+
+@pytest.mark.slow
+def test_the_grip_bears_weight_and_pull_by_friction_with_a_reserve() -> None:
+    found = GraspPlanner(HAND, "thumb", GraspRules(pull=4.0, reserve=2.0)).plan(0, AT, UPRIGHT)
+    assert found is not None
+    # 0.15 kg, friction 1, three fingers that press and a thumb that bears their sum.
+    assert 2.0 * 3.0 * found.grip == pytest.approx(2.0 * (0.15 * 9.81 + 4.0))

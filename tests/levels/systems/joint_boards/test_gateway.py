@@ -9,12 +9,12 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
-from rack.levels.level import LevelContext, Pace
+from rack.levels.level import Pace
 from rack.levels.messages import Error
 from rack.levels.robot.cell import compute_sizes
 from rack.levels.systems.joint_boards.gateway import JointGateway
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
-from tests.levels.arms import cell, config
+from tests.levels.arms import cell, config, context
 
 M = TypeVar("M", bound=Message)
 
@@ -23,7 +23,6 @@ PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
 LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
 """Velocity of every joint, rad/s."""
-BOARDS = ("near", "far")
 SIZES = compute_sizes(cell("puma560"))
 
 
@@ -32,38 +31,29 @@ def message(kind: type[M]) -> M:
 
 
 class GatewayRig:
-    """Runs a gateway; references of a steady motion are visible when those of a trajectory level
-    are."""
+    """Runs a gateway; references of a steady motion come when those of a trajectory level do."""
 
     def __init__(self) -> None:
-        robot, scene = config("puma560")
-        paces = {
-            "above": {"above": Pace(PERIOD, 1)},
-            "below": {name: Pace(1, 1) for name in BOARDS},
-        }
-        params = {"delay": DELAY * TICK_S, "missing": MISSING}
-        context = LevelContext(
-            "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, SIZES, **paces, params=params
-        )
-        self.gateway = JointGateway(context)
-        self.statuses = {name: message(JointStatus) for name in BOARDS}
+        paces = {"near": Pace(1, 1), "far": Pace(1, 1)}
+        given = {"every": EVERY, "sizes": SIZES, "above": {"above": Pace(PERIOD, 1)}}
+        given["params"] = {"delay": DELAY * TICK_S, "missing": MISSING}
+        self.gateway = JointGateway(context("gateway", config("puma560"), **given, below=paces))
+        self.statuses = {name: message(JointStatus) for name in paces}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::2] = 1
             status.target[k::2] = 1.0 + k
         self.lost: set[str] = set()
         self.tick = 0
         self.made = -1  # tick of the newest reference read
-        self.given: list[
-            tuple[int, int, float]
-        ] = []  # tick, due and position of the references given
+        # Tick, due and position of the references given.
+        self.given: list[tuple[int, int, float]] = []
 
     @property
     def status(self) -> JointStatus:
         return self.gateway.status
 
     def run(self, ticks: int, late: int = 0, missing: bool = False) -> None:
-        """Run up to a tick; references come `late` ticks late, or are `missing`; the motion goes on
-        meanwhile."""
+        """Run the motion up to a tick; references come `late` ticks late, or are `missing`."""
         for _ in range(ticks // EVERY):
             made = (self.tick - PERIOD - late) // PERIOD * PERIOD
             reference = message(JointReference)
@@ -80,10 +70,9 @@ class GatewayRig:
             before = self.gateway.command.due
             vars(self.gateway).update(above=command, statuses=statuses)
             self.gateway.process(self.tick)
-            if self.gateway.command.due != before:
-                self.given.append(
-                    (self.tick, self.gateway.command.due, float(self.gateway.command.position[0]))
-                )
+            command = self.gateway.command
+            if command.due != before:
+                self.given.append((self.tick, command.due, float(command.position[0])))
             self.tick += EVERY
 
 
@@ -93,9 +82,8 @@ def test_references_are_passed_on_with_a_constant_delay_and_in_time() -> None:
     ticks, dues, positions = zip(*rig.given, strict=True)
     assert np.diff(dues).tolist() == [PERIOD] * (len(dues) - 1)
     assert dues[0] == 2 * PERIOD + LATENCY
-    assert [due - LATENCY for due in dues] == pytest.approx(
-        [position / (SPEED * TICK_S) for position in positions]
-    )
+    moved = [position / (SPEED * TICK_S) for position in positions]
+    assert [due - LATENCY for due in dues] == pytest.approx(moved)
     # Visible a cycle later, each comes before the one before it is due.
     assert all(tick + EVERY <= due for tick, due in zip(ticks[1:], dues, strict=False))
 
@@ -122,10 +110,8 @@ def test_after_too_many_missing_references_the_boards_hold_the_arm() -> None:
     newest = rig.made + 2 * PERIOD + LATENCY
     rig.run(150, missing=True)
     assert [due for _, due, _ in rig.given[-2:]] == [newest + MISSING * PERIOD, 0]
-    assert (rig.status.state, rig.status.reason) == (
-        State.HOLDING,
-        "no reference from 'above': held after 5 extrapolated",
-    )
+    assert rig.status.state == State.HOLDING
+    assert rig.status.reason == "no reference from 'above': held after 5 extrapolated"
     rig.run(50)
     assert rig.gateway.command.due > rig.tick
     assert rig.status.reason == ""
@@ -134,11 +120,8 @@ def test_after_too_many_missing_references_the_boards_hold_the_arm() -> None:
 def test_the_boards_appear_as_one_after_the_delay() -> None:
     rig = GatewayRig()
     rig.run(50)
-    rig.statuses["far"].stopped, rig.statuses["far"].reason, rig.statuses["far"].error = (
-        1,
-        "braked",
-        Error.LIMIT,
-    )
+    far = rig.statuses["far"]
+    far.stopped, far.reason, far.error = 1, "braked", Error.LIMIT
     rig.run(DELAY)
     assert not rig.status.stopped
     rig.run(EVERY)

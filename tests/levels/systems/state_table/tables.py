@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rack.levels.systems.state_table.checks import find_flaws
 from rack.levels.systems.state_table.level import build_vocabulary
-from rack.levels.systems.state_table.table import StateTable, read_table
+from rack.levels.systems.state_table.table import read_table
 from rack.levels.tables import Positive, Table
 
 DOOR = """
@@ -74,10 +74,7 @@ class DoorPlan(Table):
 
 
 DOORS = build_vocabulary(
-    conditions={
-        "lock": ("free", "stuck", "locked"),
-        "place": ("open", "between", "shut"),
-    },
+    conditions={"lock": ("free", "stuck", "locked"), "place": ("open", "between", "shut")},
     commands={"open": (), "paint": ("colour",)},
     actions={"drive": (("slowly", "fast", "stop"),)},
     plan=DoorPlan,
@@ -88,11 +85,6 @@ LEXICON = {"colour": ("red", "green")}
 def find_mistakes(folder: Path, text: str) -> list[str]:
     """Return the mistakes in the text of a table."""
     return find_flaws(read_table(write_table(folder, text), DOORS), DOORS, LEXICON)
-
-
-def table(folder: Path, text: str = DOOR) -> StateTable:
-    """Return the table in a text, unchecked."""
-    return read_table(write_table(folder, text), DOORS)
 
 
 def write_table(folder: Path, text: str) -> Path:

@@ -1,7 +1,4 @@
-"""A level that follows a state table, cycle by cycle.
-
-Tests check the row that fires, the status, and the state of a restarted board.
-"""
+"""A level that follows a state table: the row that fires, the status, the state after a restart."""
 
 from __future__ import annotations
 
@@ -57,12 +54,12 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         paths = {}
-        for name, text in {
+        closed = DOOR.replace('"shut"', '"closed"')
+        texts = {
             "normal": f"patience = {PATIENCE_TICKS * TICK_NS / 1e9}\n{DOOR}",
-            "careful": DOOR.replace('"shut"', '"closed"').replace(
-                'place = ["open", "closed"]', 'place = ["open", "shut"]'
-            ),
-        }.items():
+            "careful": closed.replace('place = ["open", "closed"]', 'place = ["open", "shut"]'),
+        }
+        for name, text in texts.items():
             paths[name] = folder / f"{name}.toml"
             paths[name].write_text(text)
         context = SimpleNamespace(
@@ -83,18 +80,13 @@ class Bench:
     def command(self, serial: int, words: str, hold: bool = False, operator: int = 0) -> None:
         """Set the command of the level above from now on."""
         message = TableCommand.zeros({})
-        message.id = serial
-        message.words = words
-        message.hold = hold
-        message.operator = operator
+        message.id, message.words, message.hold, message.operator = serial, words, hold, operator
         self.above = Reading(message, Verdict.NEW)
 
     def order(self, serial: int, what: Operation, name: str = "") -> Message:
         """Give an operator command, and return the status after the cycle that reads it."""
         message = OperatorCommand.zeros({})
-        message.id = serial
-        message.what = what
-        message.name = name
+        message.id, message.what, message.name = serial, what, name
         self.operator = Reading(message, Verdict.NEW)
         status = self.cycle()
         self.operator = Reading(message, Verdict.OLD)
@@ -278,8 +270,7 @@ def test_the_level_below_has_answered_when_it_echoes_the_newest_command(
     state: State, echo: int, serial: int, expected: str
 ) -> None:
     status = TableStatus.zeros({})
-    status.state = state
-    status.echo = echo
+    status.state, status.echo = state, echo
     assert classify_answer(Reading(status, Verdict.OLD), serial) == expected
     assert classify_answer(Reading(status, Verdict.NONE), serial) == "waiting"
     assert classify_answer(Reading(status, Verdict.OLD, is_lost=True), serial) == "lost"

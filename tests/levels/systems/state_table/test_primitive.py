@@ -13,11 +13,7 @@ from rack.boards.config import load
 from rack.boards.config.resolved import resolve
 from rack.levels.level import LevelContext
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
-from rack.levels.systems.state_table.primitive import (
-    JointMove,
-    JointMoveStatus,
-    PrimitiveTable,
-)
+from rack.levels.systems.state_table.primitive import JointMove, JointMoveStatus, PrimitiveTable
 
 M = TypeVar("M", bound=Message)
 
@@ -53,9 +49,7 @@ class Bench:
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
         """Set the command of the level above from now on."""
         command = self.message(JointMove)
-        command.joints = joints
-        command.speed = speed
-        command.object = row
+        command.joints, command.speed, command.object = joints, speed, row
         self.above = {"move": Reading(command, Verdict.NEW)}
 
     def look(self) -> dict[str, str]:
@@ -209,9 +203,7 @@ def test_a_gripper_that_cannot_close_completely_holds_something(
 
 def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) -> None:
     last = bench.message(JointMoveStatus)
-    last.closed = 1
-    last.held = 1
-    last.object = 1
+    last.closed = last.held = last.object = 1
     last.table = bench.level.table_name
     last.in_state = bench.level.state
     last.position = bench.home + 0.1

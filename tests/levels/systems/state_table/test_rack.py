@@ -40,9 +40,8 @@ def test_the_rack_picks_up_a_block_although_a_board_dies(rack_name: str) -> None
 
 def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "task.toml"
-    path.write_text(
-        (FOLDER / "tables" / "task.toml").read_text().replace('place = "left"', 'place = "roof"')
-    )
+    text = (FOLDER / "tables" / "task.toml").read_text()
+    path.write_text(text.replace('place = "left"', 'place = "roof"'))
     with pytest.raises(ConfigError) as caught:
         resolve(load("nist-state-table", [f"board.task.params.tables.normal={path}"]))
     expected = (
@@ -53,13 +52,10 @@ def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -
 
 
 def test_objects_that_the_scene_lacks_are_named() -> None:
-    plan = TaskPlanConfig.model_validate(
-        {"step": [{"object": "a", "place": "x"}, {"object": "b", "place": "x"}]}
-    )
-    scene = SceneConfig(objects=("a", "c"))
-    assert TaskTable.find_plan_flaws(scene, plan) == [
-        "plan.step[1].object: unknown 'b'; objects: a, c"
-    ]
+    steps = [{"object": name, "place": "x"} for name in ("a", "b")]
+    plan, scene = TaskPlanConfig(step=steps), SceneConfig(objects=("a", "c"))
+    flaws = TaskTable.find_plan_flaws(scene, plan)
+    assert flaws == ["plan.step[1].object: unknown 'b'; objects: a, c"]
 
 
 def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: Path) -> None:
@@ -68,8 +64,8 @@ def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: 
     path.write_text("\n".join(line for line in lines if not line.startswith("left =")))
     with pytest.raises(ConfigError) as caught:
         resolve(load("nist-state-table", [f"board.elemental_move.params.tables.careful={path}"]))
-    assert (
-        str(caught.value)
-        == 'board.elemental_move.params.tables.careful = "careful.toml": does not know \'place'
-        " left', as 'normal' does; all tables of a level know the same commands"
+    expected = (
+        "board.elemental_move.params.tables.careful = \"careful.toml\": does not know 'place left',"
+        " as 'normal' does; all tables of a level know the same commands"
     )
+    assert str(caught.value) == expected

@@ -27,7 +27,7 @@ def _rounded_alike() -> None:
         ("nist-state-table/three-poses", None, 8.0),
     ],
 )
-def test_the_whole_task_repeats_its_snapshot(
+def test_the_task_repeats_its_snapshot(
     name: str, faults: str | None, seconds: float, rack_name: str
 ) -> None:
     config = load(name, [f"name={rack_name}", "clock.mode=lockstep"], faults)

@@ -10,19 +10,20 @@ import numpy as np
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.level import InputPort, LevelContext, Pace
+from rack.levels.level import InputPort, Pace
 from rack.levels.messages import WorldState
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.joint_boards.messages import JointStatus
 from rack.levels.systems.trajectory.executor import TrajectoryExecutor
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest
-from tests.levels.arms import config
+from tests.levels.arms import config, context
 
 M = TypeVar("M", bound=Message)
 
 CLOCK_NS, EVERY = 1_000_000, 20
 PERIOD_S = EVERY * CLOCK_NS * 1e-9
+VERDICTS = (Verdict.NEW, Verdict.OLD)
 
 
 class TrajectoryRig:
@@ -38,19 +39,8 @@ class TrajectoryRig:
         self._kinds: dict[type[Message], np.dtype] = {}
         self.tick = 0
         paces = {f"joints{k}": Pace(1, 1) for k in range(boards)}
-        self.context = LevelContext(
-            board="trajectory",
-            every=EVERY,
-            within_cycles=1,
-            clock_ns=CLOCK_NS,
-            seed=1,
-            robot=robot,
-            scene=scene,
-            task={},
-            sizes=self.sizes,
-            below=paces,
-            params=params,
-        )
+        given = {"every": EVERY, "sizes": self.sizes, "below": paces, "params": params}
+        self.context = context("trajectory", (robot, scene), **given)
         self.level = self.level_class(self.context)
         self.written: dict[str, Any] = {
             port: self.message(kind.message) for port, kind in self.level.outputs.items()
@@ -85,12 +75,8 @@ class TrajectoryRig:
         """Queue a request and return its id."""
         self.ids += 1
         request = self.message(self.request_type)
-        request.id, request.kind, request.body, request.quaternion = (
-            self.ids,
-            kind,
-            -1,
-            (0.0, 0.0, 1.0, 0.0),
-        )
+        request.id, request.kind, request.body = self.ids, kind, -1
+        request.quaternion = (0.0, 0.0, 1.0, 0.0)
         for name, value in fields.items():
             setattr(request, name, value)
         self.queue.append(request)
@@ -104,10 +90,8 @@ class TrajectoryRig:
         self.order.id, self.order.what, self.ordered = self.order.id + 1, what, True
 
     def restart(self) -> None:
-        """Replace the level as after the death of its board.
+        """Replace the level as after the death of its board: set points end, the boards hold."""
 
-        Its set points end, and the boards hold.
-        """
         self.level = self.level_class(self.context)
         self._connect()
         self.brake()
@@ -117,29 +101,19 @@ class TrajectoryRig:
             status.holding, status.target_velocity = 1, 0.0
 
     def read(self) -> None:
-        taken, self.queue = (
-            self.queue[: self.level.max_messages("requests")],
-            self.queue[self.level.max_messages("requests") :],
-        )
-        empty = self.message(self.request_type)
-        requests = (
-            Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1]))
-            if taken
-            else Reading(empty, Verdict.OLD)
-        )
+        most = self.level.max_messages("requests")
+        taken, self.queue = self.queue[:most], self.queue[most:]
+        requests = Reading(self.message(self.request_type), Verdict.OLD)
+        if taken:
+            requests = Reading(taken[-1], Verdict.NEW, False, tuple(taken[:-1]))
         boards = {
-            name: Reading(
-                status, Verdict.OLD if name in self.lost else Verdict.NEW, name in self.lost
-            )
+            name: Reading(status, VERDICTS[name in self.lost], name in self.lost)
             for name, status in self.statuses.items()
         }
         ordered, self.ordered = self.ordered, False
-        own = {
-            port: self._last(source)
-            for port, source in self.level.inputs.items()
-            if source.source[:4] == "own."
-        }
-        own["operator"] = Reading(self.order, Verdict.NEW if ordered else Verdict.OLD)
+        sources = {p: i for p, i in self.level.inputs.items() if i.source.startswith("own.")}
+        own = {port: self._last(source) for port, source in sources.items()}
+        own["operator"] = Reading(self.order, VERDICTS[not ordered])
         world = Reading(self.world, Verdict.NEW)
         given = {"requests": requests, "boards": boards, "world": world, **own, **self.others()}
         vars(self.level).update(given)
@@ -159,11 +133,8 @@ class TrajectoryRig:
         before = self.written["command"]
         for status in self.statuses.values():
             if before.due and not status.stopped:
-                status.holding, status.target, status.target_velocity = (
-                    0,
-                    before.position,
-                    before.velocity,
-                )
+                status.holding, status.target = 0, before.position
+                status.target_velocity = before.velocity
             else:
                 status.holding, status.target_velocity = 1, 0.0
 
@@ -187,17 +158,13 @@ class TrajectoryRig:
     def ends(self) -> dict[int, int]:
         """Return how the last requests ended, by id."""
         status = self.written["status"]
-        return {
-            int(request): int(how)
-            for request, how in zip(status.ended, status.ends, strict=True)
-            if request
-        }
+        ended = zip(status.ended, status.ends, strict=True)
+        return {int(request): int(how) for request, how in ended if request}
 
     def excess(self) -> tuple[float, float]:
         """Return the largest velocity and acceleration so far as fractions of the limits."""
         speeds = np.diff(self.positions, axis=0) / PERIOD_S
         bends = np.diff(speeds, axis=0) / PERIOD_S
         limits = self.cell.limits
-        return float(np.abs(speeds / limits.velocity).max()), float(
-            np.abs(bends / limits.acceleration).max()
-        )
+        fastest, hardest = np.abs(speeds / limits.velocity), np.abs(bends / limits.acceleration)
+        return float(fastest.max()), float(hardest.max())

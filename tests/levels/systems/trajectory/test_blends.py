@@ -38,9 +38,7 @@ def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str)
     while rig.written["status"].done < rig.ids and rig.tick < 60_000:
         rig.cycle()
     status = rig.run(0.5)
-    speed, acceleration = rig.excess()
-    assert speed <= 1.0
-    assert acceleration <= 1.0
+    assert max(rig.excess()) <= 1.0
     assert status.resting
     assert not status.current
     assert status.done == rig.ids
@@ -68,9 +66,7 @@ def test_a_cancel_at_any_time_ramps_to_rest_and_drops_the_rest(cycles: int) -> N
     cancel = rig.request(MotionKind.CANCEL)
     after = rig.joints([0.1] * 6)
     rig.run(4.0)
-    speed, acceleration = rig.excess()
-    assert speed <= 1.0
-    assert acceleration <= 1.0
+    assert max(rig.excess()) <= 1.0
     ends = rig.ends()
     assert ends[cancel] == ends[after] == RequestEnd.DONE
     assert all(ends[r] == before.get(r, RequestEnd.CANCELLED) for r in first)

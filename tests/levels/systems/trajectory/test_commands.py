@@ -9,7 +9,6 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import copy_message
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext
 from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import (
     MotionKind,
@@ -17,27 +16,17 @@ from rack.levels.systems.trajectory.messages import (
     MotionStatus,
     RequestEnd,
 )
-from tests.levels.arms import config
+from tests.levels.arms import config, context
 
 PUMA, SCENE = config("puma560")
 SIZES = {"joints": 6}
-CONTEXT = LevelContext(
-    board="program",
-    every=1,
-    within_cycles=1,
-    clock_ns=1_000_000,
-    seed=1,
-    robot=PUMA,
-    scene=SCENE,
-    task={},
-    sizes=SIZES,
-)
+CONTEXT = context("program", (PUMA, SCENE), sizes=SIZES)
 
 
 class Level:
-    """A bus with a level that carries out one request per wait of a second.
+    """A bus, both ports of a program, and a level that carries out one request per wait.
 
-    It is also both ports of the program. At most `room` messages may wait.
+    At most `room` messages may wait.
     """
 
     def __init__(self, room: int = 100, sent: int = 0) -> None:
@@ -54,13 +43,10 @@ class Level:
         self.time_s += 1.0
         if self.queue:
             request = self.queue.popleft()
+            is_cancel = request.kind == MotionKind.CANCEL
             if request.id in self.loses:
                 self.loses.remove(request.id)
-            elif (
-                request.id == self.status.done + 1
-                or not self.done
-                or request.kind == MotionKind.CANCEL
-            ):
+            elif request.id == self.status.done + 1 or not self.done or is_cancel:
                 self.done.append(request)
                 self.status.done = self.status.taken = request.id
                 self.status.ended[0], self.status.ends[0] = request.id, RequestEnd.DONE
@@ -104,16 +90,13 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     # A wait ends when its condition holds.
     assert not arm.wait(until=lambda: arm.done(first))
     assert not arm.done(last)
-    with pytest.raises(
-        LevelError, match=r"line: body = block9: not in the scene; its bodies are block1, "
-    ):
+    why = r"line: body = block9: not in the scene; its bodies are block1, "
+    with pytest.raises(LevelError, match=why):
         arm.line((0.0, 0.0, 0.1), body="block9")
 
 
 @pytest.mark.parametrize(("room", "loses"), [(2, ()), (100, (2,))], ids=["full", "lost"])
-def test_no_request_is_left_out_after_a_full_queue_or_a_loss(
-    room: int, loses: tuple[int, ...]
-) -> None:
+def test_no_request_is_left_out(room: int, loses: tuple[int, ...]) -> None:
     level = Level(room=room)
     level.loses = {*loses}
     arm = motions(level)
@@ -127,7 +110,5 @@ def test_a_restarted_process_cancels_first_and_uses_new_numbers() -> None:
     level = Level(sent=7)
     arm = motions(level)
     arm.stay(0.1)
-    assert [(request.id, request.kind) for request in level.queue] == [
-        (8, MotionKind.CANCEL),
-        (9, MotionKind.STAY),
-    ]
+    sent = [(request.id, request.kind) for request in level.queue]
+    assert sent == [(8, MotionKind.CANCEL), (9, MotionKind.STAY)]

@@ -1,7 +1,4 @@
-"""A guarded line ends by a lasting change of torque.
-
-Changes across brakes, holds or missed cycles do not end it.
-"""
+"""A guarded line ends by a lasting change of torque, but not across brakes or missed cycles."""
 
 from __future__ import annotations
 
@@ -33,16 +30,14 @@ def press(rig: TrajectoryRig, torque: float) -> None:
     next(iter(rig.statuses.values())).torque[2] += torque
 
 
-def run_to_end(rig: TrajectoryRig, seconds: float = 0.6) -> int:
+def run_to_end(rig: TrajectoryRig) -> int:
     """Run for some time, and return how the guarded line has ended."""
-    rig.run(seconds)
+    rig.run(0.6)
     return rig.ends().get(1, RequestEnd.NONE)
 
 
 @pytest.mark.parametrize("torque", [TOUCH, -TOUCH])
-def test_a_touch_ends_the_line_and_the_next_request_continues_from_there(
-    rig: TrajectoryRig, torque: float
-) -> None:
+def test_a_touch_ends_the_line_where_it_is(rig: TrajectoryRig, torque: float) -> None:
     height = float(rig.written["status"].tool[2])
     press(rig, torque)
     assert run_to_end(rig) == RequestEnd.GUARDED
@@ -80,16 +75,10 @@ def across_a_stale_status(rig: TrajectoryRig) -> float:
     return TOUCH
 
 
-@pytest.mark.parametrize(
-    "before",
-    [
-        lambda rig: 0.9 * MOST,
-        in_one_cycle,
-        across_a_hold,
-        across_missed_cycles,
-        across_a_stale_status,
-    ],
-)
+INTERRUPTIONS = (in_one_cycle, across_a_hold, across_missed_cycles, across_a_stale_status)
+
+
+@pytest.mark.parametrize("before", [lambda rig: 0.9 * MOST, *INTERRUPTIONS])
 def test_a_small_or_interrupted_change_of_torque_is_not_a_touch(
     rig: TrajectoryRig, before: Callable[[TrajectoryRig], float]
 ) -> None:

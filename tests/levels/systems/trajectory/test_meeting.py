@@ -14,7 +14,7 @@ LARGEST = 2**32 - 1
 
 
 @pytest.mark.parametrize(
-    ("partner_number", "partner_arrived_s", "start_s"),
+    ("number", "arrived_s", "start_s"),
     [
         (1, 3.0, 4.1),
         (1, 5.0, 5.1),
@@ -30,13 +30,11 @@ LARGEST = 2**32 - 1
         (1, math.inf, math.inf),
     ],
 )
-def test_two_arms_begin_after_the_later_arrival(
-    partner_number: int, partner_arrived_s: float, start_s: float
-) -> None:
+def test_arms_begin_after_the_later_arrival(number: int, arrived_s: float, start_s: float) -> None:
     work = SimpleNamespace(
         meeting=SimpleNamespace(number=1, arrived=ARRIVED_S),
-        partner_number=partner_number,
-        partner_arrived_s=partner_arrived_s,
+        partner_number=number,
+        partner_arrived_s=arrived_s,
         _meeting_s=MEETING_S,
     )
     start = MeetingWork.start_s.fget

@@ -1,7 +1,4 @@
-"""The planning level alone.
-
-It queues the requests of a program a few steps ahead of the arm. None is lost or carried out twice.
-"""
+"""The planning level alone: it queues each request of a program once, some steps ahead."""
 
 from __future__ import annotations
 
@@ -14,13 +11,13 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import State
 from rack.levels.errors import ProgramError
-from rack.levels.level import LevelContext, Sender
+from rack.levels.level import Sender
 from rack.levels.messages import Error, WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, MotionStatus
 from rack.levels.systems.trajectory.planner import MotionProgram, RequestExecutor, RequestPlanner
-from tests.levels.arms import config
+from tests.levels.arms import config, context
 
 ROBOT, SCENE = config("puma560_crossing")
 CELL = build_cell(ROBOT, SCENE, 1_000_000)
@@ -32,20 +29,10 @@ MOVES = [{"do": "move", "joints": [0.1 * k, 1.4, -3.1, 0.0, -1.44, 0.0]} for k i
 class PlanningRig:
     """Runs a planner. The test sets the progress of the level below."""
 
-    def __init__(self, steps: Sequence[Mapping[str, Any]], places: int = 32, **params: Any) -> None:
-        self.context = LevelContext(
-            board="planning",
-            every=EVERY,
-            within_cycles=2,
-            clock_ns=1_000_000,
-            seed=1,
-            robot=ROBOT,
-            scene=SCENE,
-            task={"step": list(steps)},
-            sizes=SIZES,
-            params=params,
-        )
-        self.tick, self.places = 0, places
+    def __init__(self, steps: Sequence[Mapping[str, Any]], **params: Any) -> None:
+        given = {"every": EVERY, "within_cycles": 2, "sizes": SIZES, "params": params}
+        self.context = context("planning", (ROBOT, SCENE), task={"step": list(steps)}, **given)
+        self.tick = 0
         self.below = MotionStatus.zeros(SIZES)
         self.world = WorldState.zeros(SIZES)
         self.world.quaternion[:, 0] = 1.0
@@ -58,9 +45,6 @@ class PlanningRig:
         self.planner.store_output("plan", Sender(self.request, self._send, lambda: 1))
 
     def _send(self) -> bool:
-        """Queue a copy if there is a free place."""
-        if len(self.sent) - self.below.taken >= self.places:
-            return False
         self.sent.append(self.request.record.copy())
         return True
 
@@ -84,9 +68,8 @@ def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
     assert rig.run(5) == [4]
     rig.below.taken = rig.below.done = 4
     assert rig.run(5) == [5, 6]
-    assert [record["joints"][0] for record in rig.sent] == pytest.approx(
-        [0.1 * k for k in range(6)]
-    )
+    firsts = [record["joints"][0] for record in rig.sent]
+    assert firsts == pytest.approx([0.1 * k for k in range(6)])
 
 
 def test_a_restarted_planner_continues_after_the_newest_request_taken() -> None:
@@ -108,26 +91,19 @@ def test_a_request_that_is_not_taken_is_sent_again() -> None:
 
 def test_tool_goals_become_joint_positions_near_those_before() -> None:
     place = [0.45, 0.30, 0.75]
-    rig = PlanningRig(
-        [
-            {"do": "move", "position": place},
-            {"do": "line", "position": [0.6, 0.1, 0.65]},
-            {"do": "home"},
-            {"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True},
-            {"do": "move", "position": [3.0, 0.0, 0.5]},
-        ],
-        ahead=5,
-    )
+    steps = [
+        {"do": "move", "position": place},
+        {"do": "line", "position": [0.6, 0.1, 0.65]},
+        {"do": "home"},
+        {"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True},
+        {"do": "move", "position": [3.0, 0.0, 0.5]},
+    ]
+    rig = PlanningRig(steps, ahead=5)
     rig.run(3)
     ik = InverseKinematics(CELL, 1)
     assert np.allclose(ik.compute_tool_pose(rig.sent[0]["joints"]).position, place, atol=1e-4)
-    assert [record["kind"] for record in rig.sent] == [
-        MotionKind.JOINTS,
-        MotionKind.POSE,
-        MotionKind.JOINTS,
-        MotionKind.POSE,
-        MotionKind.POSE,
-    ]
+    joints, pose = MotionKind.JOINTS, MotionKind.POSE
+    assert [record["kind"] for record in rig.sent] == [joints, pose, joints, pose, pose]
     assert (rig.sent[3]["body"], rig.sent[3]["live"]) == (SCENE.bodies.index("post"), 1)
     assert rig.sent[4]["position"].tolist() == [3.0, 0.0, 0.5]
     assert np.array_equal(rig.sent[2]["joints"], CELL.home)
@@ -135,21 +111,16 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
     assert np.allclose(rig.sent[1]["quaternion"], ik.compute_tool_pose(CELL.home).quaternion)
 
 
+AT, LINE = "task.step[0]", {"do": "line", "position": [0, 0, 0]}
+ONE = {"do": "move", "joints": [0.0]}
+
+
 @pytest.mark.parametrize(
     ("step", "why"),
     [
-        (
-            {"do": "move", "joints": [0.0]},
-            "task.step[0].joints = [0.0]: has 1 values; must have 6, one per joint",
-        ),
-        (
-            {"do": "line", "position": [0, 0, 0], "body": "car"},
-            "task.step[0].body = 'car': not in the scene; bodies: ",
-        ),
-        (
-            {"do": "line", "position": [0, 0, 0], "live": True},
-            "a live goal needs a body that it follows",
-        ),
+        (ONE, f"{AT}.joints = [0.0]: has 1 values; must have 6, one per joint"),
+        ({**LINE, "body": "car"}, f"{AT}.body = 'car': not in the scene; bodies: "),
+        ({**LINE, "live": True}, "a live goal needs a body that it follows"),
         ({"do": "move"}, "a move has either position or joints"),
     ],
 )

@@ -12,6 +12,7 @@ from rack.levels.operator import Answer, Operation
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
 
+JOINTS, POSE = MotionKind.JOINTS, MotionKind.POSE
 DOWN = (0.0, 0.0, 1.0, 0.0)
 POST = 3  # row of a body that moves
 
@@ -28,9 +29,8 @@ class TrackingRig(TrajectoryRig):
     def track(self) -> None:
         """Place the body as sensed now."""
         now_s = self.tick * 1e-3
-        self.world.position[POST] = np.add(
-            self.tool, [0.0, self.speed * max(now_s - self.at, 0.0), -0.1]
-        )
+        moved = [0.0, self.speed * max(now_s - self.at, 0.0), -0.1]
+        self.world.position[POST] = np.add(self.tool, moved)
         self.world.velocity[POST] = [0.0, self.speed * (now_s >= self.at), 0.0]
         self.world.sensed = self.tick
 
@@ -54,9 +54,7 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     ahead_s = (rig.tick + EVERY) * 1e-3 - rig.at
     assert np.allclose(status.tool - rig.tool, [0, rig.speed * ahead_s, 0], atol=1e-3)
     rig.follow(4.0)
-    speed, acceleration = rig.excess()
-    assert speed <= 1.0
-    assert acceleration <= 1.0
+    assert max(rig.excess()) <= 1.0
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
 
 
@@ -80,10 +78,8 @@ def test_a_request_fails_after_its_waits_unless_somebody_stops_the_arm(waits: st
             board.stopped = False
         status = rig.run(0.1)
     if waits == "boards that hold":
-        assert status.reason == (
-            f"request {waiting}: waited for 0.4 s: waiting for joints0: it does not follow set"
-            " points"
-        )
+        why = "waiting for joints0: it does not follow set points"
+        assert status.reason == f"request {waiting}: waited for 0.4 s: {why}"
         assert status.error == Error.STALLED
         assert rig.ends() == {waiting: RequestEnd.FAILED, waiting + 1: RequestEnd.CANCELLED}
     else:
@@ -103,12 +99,8 @@ def test_after_an_error_new_requests_are_refused_until_a_cancel() -> None:
     assert f"request {wrong}: no joint positions" in status.reason
     assert status.resting
     ends = rig.ends()
-    assert (ends[1], ends[wrong], ends[dropped], ends[late]) == (
-        RequestEnd.DONE,
-        RequestEnd.REFUSED,
-        RequestEnd.CANCELLED,
-        RequestEnd.REFUSED,
-    )
+    assert (ends[1], ends[dropped]) == (RequestEnd.DONE, RequestEnd.CANCELLED)
+    assert ends[wrong] == ends[late] == RequestEnd.REFUSED
     rig.request(MotionKind.CANCEL)
     again = rig.joints([0] * 6)
     status = rig.run(3.0)
@@ -118,25 +110,19 @@ def test_after_an_error_new_requests_are_refused_until_a_cancel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "why"),
+    ("kind", "fields", "why"),
     [
-        (
-            {"kind": MotionKind.JOINTS, "joints": [9.0] * 6},
-            "joint 1 to 9 rad; permitted: -2.788 to 2.788",
-        ),
-        ({"kind": MotionKind.JOINTS, "joints": [np.nan] * 6}, "joint 1 to nan rad"),
-        ({"kind": MotionKind.POSE, "position": [np.nan] * 3}, "the pose is not finite"),
-        (
-            {"kind": MotionKind.POSE, "position": [0.5] * 3, "body": 7},
-            "body 7 is not in the world model",
-        ),
-        ({"kind": MotionKind.STAY, "segment": -1.0}, "times 0 and -1 s"),
-        ({"kind": 9}, "kind 9; permitted: 1 to 5"),
+        (JOINTS, {"joints": [9.0] * 6}, "joint 1 to 9 rad; permitted: -2.788 to 2.788"),
+        (JOINTS, {"joints": [np.nan] * 6}, "joint 1 to nan rad"),
+        (POSE, {"position": [np.nan] * 3}, "the pose is not finite"),
+        (POSE, {"position": [0.5] * 3, "body": 7}, "body 7 is not in the world model"),
+        (MotionKind.STAY, {"segment": -1.0}, "times 0 and -1 s"),
+        (9, {}, "kind 9; permitted: 1 to 5"),
     ],
 )
-def test_an_impossible_request_is_refused_in_one_line(fields: dict, why: str) -> None:
+def test_an_impossible_request_is_refused_in_one_line(kind: int, fields: dict, why: str) -> None:
     rig = TrajectoryRig()
-    rig.request(**fields)
+    rig.request(kind, **fields)
     status = rig.run(0.2)
     assert status.reason.startswith(f"request 1: {why}")
     assert rig.ends() == {1: RequestEnd.REFUSED}
@@ -223,9 +209,7 @@ def test_an_operator_holds_and_resumes() -> None:
     assert 0.0 < status.progress < 1.0
     rig.say(Operation.RESUME)
     assert rig.run(4.0).state == State.DONE
-    speed, acceleration = rig.excess()
-    assert speed <= 1.0
-    assert acceleration <= 1.0
+    assert max(rig.excess()) <= 1.0
 
 
 def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> None:
