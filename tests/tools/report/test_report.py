@@ -59,7 +59,7 @@ def test_times_of_a_task_follow_equation_3_5() -> None:
     cycles = np.array(
         [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
     )
-    times = compute_task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
+    times = compute_task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3), due_ns=10 * MS)
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
     assert times["communication_ms"]["max"] == 2.0
