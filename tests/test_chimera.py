@@ -16,7 +16,7 @@ from rack.backplane.process import DEADLINE, Reservation
 from rack.backplane.trace import Flag, open_trace_ring
 from rack.backplane.words import Block, Scheduler, System
 from rack.boards import Rack
-from rack.boards.config import load, resolve
+from rack.boards.config import build_rack_timing, load, resolve
 from rack.boards.errors import ConfigError, LaunchError
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
@@ -192,6 +192,38 @@ def test_under_an_overload_urgency_alone_spares_the_critical_boards(rack_name: s
     assert critical == {"arm", "servo", "trajectory"}
     assert {board for board, missed in urgency.missed.items() if missed} == {*BOARDS} - critical
     assert run_overload(rack_name, EARLIEST) == earliest
+
+
+def predict_late(*settings: str) -> set[str]:
+    """Return the boards whose responses are too long by `rack check`."""
+    config = load("chimera/overload", ["clock.mode=lockstep", *settings])
+    timing = build_rack_timing(config, resolve(config).layout)
+    return {response.task for response in timing.responses if not response.holds}
+
+
+FREE = ("timing.context_switch_ms=0", "timing.clock_ms=0.001")
+"""In lockstep, neither context switches nor the clock take simulated time."""
+LIGHTER = tuple(f"board.world.budget.process_ms={ms}" for ms in (5.2, 4.4, 4.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", LIGHTER)
+def test_the_check_predicts_which_boards_are_late_under_each_scheduler(
+    rack_name: str, world: str
+) -> None:
+    found = []
+    for scheduler in ("clock.scheduler=fixed-priority", EARLIEST, URGENCY):
+        ran = run_overload(rack_name, scheduler, world, *FREE)
+        late = {board for board, missed in ran.missed.items() if missed}
+        predicted = predict_late(scheduler, world, *FREE)
+        assert late <= predicted, scheduler
+        assert bool(late) == bool(predicted), scheduler
+        found.append(late)
+    assert [len(late) for late in found] == {
+        "5.2": [2, 5, 2],
+        "4.4": [0, 0, 1],
+        "4.0": [0, 0, 0],
+    }[world[-3:]]
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ class LayoutBuilder:
         self.sent_ns = {
             name: round(board.budget.send_within_ms * NS_PER_MS)
             for name, board in wiring.config.board.items()
-            if board.budget is not None and board.budget.send_within_ms is not None
+            if board.budget and board.budget.send_within_ms
         }
         self._retained_ticks = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
         self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.ports.values()}

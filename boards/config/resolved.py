@@ -320,8 +320,6 @@ class Examination:
         of_host = self._wiring.host_side_mailboxes
         from_host = self._wiring.mailboxes_from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
-        scheduling = build_scheduling(self._config, spec.board, spec.every) if is_executor else None
-        budget_ns = round((board.busy_ms if is_executor else board.planning_ms) * 1e6)
         return TaskWiring(
             task=ports.task,
             target=ports.place.target,
@@ -338,10 +336,12 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            scheduling=scheduling,
+            scheduling=(
+                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
+            ),
             compares=is_executor and board.compare,
             votes=is_executor and board.vote,
-            budget_ns=(scheduling.cost_ns if scheduling else 0) or budget_ns,
+            budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

@@ -37,6 +37,13 @@ def find_scheduler(config: RackConfig, board: str) -> Scheduler:
     return Scheduler.find(word)
 
 
+def find_clock_scheduler(config: RackConfig) -> Scheduler:
+    """Return the scheduler of the clock, which competes like the boards on its core."""
+    core = config.clock.core
+    found = [find_scheduler(config, n) for n, board in config.board.items() if board.core == core]
+    return max([Scheduler.FIXED_PRIORITY, *found])
+
+
 def build_scheduling(config: RackConfig, board: str, every: int) -> Scheduling | None:
     """Return how the executor of a board is scheduled. None if the config names no scheduler.
 
@@ -65,8 +72,7 @@ def compute_clock_reservation(config: RackConfig) -> Reservation | None:
 
     None if no board on its core does. Otherwise the clock would run below that board.
     """
-    names = [name for name, board in config.board.items() if board.core == config.clock.core]
-    if Scheduler.EARLIEST_DEADLINE_FIRST not in [find_scheduler(config, name) for name in names]:
+    if find_clock_scheduler(config) is not Scheduler.EARLIEST_DEADLINE_FIRST:
         return None
     return _compute_reservation(config, config.timing.clock_ms, 1)
 

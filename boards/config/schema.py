@@ -172,7 +172,7 @@ class BudgetConfig(Table):
     plan_within_ms: float | None = Field(None, gt=0, le=1e7)
     """longest acceptable time for a new plan [ms]; limits within_cycles"""
     send_within_ms: float | None = Field(None, gt=0, le=1e7)
-    """time after a release at which interrupts are sent [ms]; default: the worst-case response"""
+    """interrupts are sent this long after a release [ms]; default: the worst-case response"""
 
 
 class TransferConfig(Table):

@@ -14,6 +14,9 @@ from rack.boards.config.layout import LayoutBuilder
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import build_rack_timing
 
+NEVER = 1 << 62
+"""A response in ns without a bound. The message is then sent at the end of the cycle."""
+
 
 def settle_sending(config: RackConfig, builder: LayoutBuilder) -> Layout:
     """Return the layout of a config without mistakes, with the instants of sending.
@@ -31,17 +34,13 @@ def settle_sending(config: RackConfig, builder: LayoutBuilder) -> Layout:
     while True:
         layout = builder.build_layout()
         senders = {
-            box.writer: box.interrupt
+            box.writer: box.interrupt.sent_ns
             for box in layout.mailboxes
-            if box.interrupt is not None and box.writer not in fixed
+            if box.interrupt and box.writer not in fixed
         }
-        late: dict[str, int] = {}
+        before_ns = dict(builder.sent_ns)
         for task in build_rack_timing(config, layout).responses if senders else ():
-            if (spec := senders.get(task.task)) is not None:
-                cycle_ns = spec.ahead * layout.clock_ns
-                response_ns = min(task.response_ns or cycle_ns, cycle_ns)
-                if response_ns > spec.sent_ns:
-                    late[task.task] = response_ns
-        if not late:
+            if task.task in senders:
+                builder.sent_ns[task.task] = max(senders[task.task], task.response_ns or NEVER)
+        if builder.sent_ns == before_ns:
             return layout
-        builder.sent_ns |= late

@@ -9,6 +9,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.interrupt import get_interrupt_spec, list_sources
 from rack.boards.config.command import CommandConfig
+from rack.boards.config.schedulers import find_clock_scheduler, find_scheduler
 from rack.boards.config.schema import (
     BudgetConfig,
     RackConfig,
@@ -48,7 +49,15 @@ def build_rack_timing(
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
         clock=TimedTask(
-            CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, config.tick_ns, parts
+            CLOCK,
+            CLOCK,
+            "clock",
+            config.clock.core,
+            config.clock.priority,
+            config.tick_ns,
+            parts,
+            scheduler=find_clock_scheduler(config),
+            is_critical=True,
         ),
         boards={
             name: _build_board_timing(config, layout, name, measured.get(name))
@@ -128,6 +137,8 @@ def _build_board_timing(
         plan_within_ns=within_ns,
         queues=tuple(box.name for box in layout.mailboxes if box.capacity and name in box.readers),
         phase=board.phase,
+        scheduler=find_scheduler(config, name),
+        is_urgent=board.critical,
         reads=_find_read_ticks(layout, name),
     )
 

@@ -73,7 +73,7 @@ class VirtualControlLoop(Task):
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
         if wiring.scheduling is not None and wiring.scheduling.cost_ns:
             # Import it only in racks that need it.
-            # The step of an interrupt handler includes the time of the cycle.
+            # The step of an interrupt handler includes the budget of the cycle.
             cost_ns = 0 if self.serve else wiring.scheduling.cost_ns
             step = import_module(SIMULATED_CORES).CoreStep(self, cost_ns)
             self.simulated.steps.append(step)

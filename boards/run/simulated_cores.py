@@ -82,7 +82,8 @@ class SimulatedCores:
                     self._add_job(core, name, begin_ns)
             while (job := core.run_until(begin_ns + self._clock_ns)) is not None:
                 task = self._tasks[job.task]
-                task.block[Block.COMPUTING_NS] = core.now_ns
+                # A job that ends with the tick ends in it.
+                task.block[Block.COMPUTING_NS] = min(core.now_ns, begin_ns + self._clock_ns - 1)
                 self._driver.resume_cycle(task)
                 # If the job has missed its deadline, the cycle waits once more.
                 self._driver.resume_cycles(tick)
@@ -112,7 +113,7 @@ class SimulatedCores:
                     task.spec.priority,
                     self._loads[name].is_critical,
                     ready_at,
-                    deadline_ns=task.deadline * self._clock_ns,
+                    deadline_ns=(release + task.spec.every) * self._clock_ns,
                     left_ns=block[Block.COMPUTING_NS],
                 )
             )

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any
 
+from rack.backplane.words import Scheduler
 from rack.boards.timing.frames import CoreFrames, compute_core_frames
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.system_response import Prediction, predict_response
@@ -104,6 +105,8 @@ def _list_uncounted(rack: RackTiming) -> dict[str, str]:
 
 def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     """Yield a sentence for each limit of the prediction."""
+    if words := {task.scheduler.word for task in rack.tasks} - {Scheduler.FIXED_PRIORITY.word}:
+        yield f"response times are those of the whole schedule by {' and '.join(sorted(words))}"
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
     ]:

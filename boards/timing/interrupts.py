@@ -14,6 +14,7 @@ from rack.backplane.mailbox.inbox import (
     Work,
     compute_burst,
 )
+from rack.boards.timing.response_time import compute_response_time
 
 MAX_EVENTS = 20_000
 """Largest number of messages and computations that are simulated, until they repeat."""
@@ -54,7 +55,10 @@ class InboxTiming:
         longest_ns = MAX_PREEMPTED_CYCLES * self.period_ns
         count = sum(whole_ns // period_ns for period_ns in periods_ns)
         if count > MAX_EVENTS or not all(source.is_periodic for source in self.sources):
-            return self._bound_cost_ns(time_ns, longest_ns)
+            loads = [(source.service_ns, source.every_ns) for source in self.sources]
+            horizon_ns = time_ns + longest_ns
+            end_ns = compute_response_time(time_ns, loads, 0, sharing=(), horizon=horizon_ns)
+            return longest_ns if end_ns is None else end_ns - time_ns
         # After the latest first message, everything repeats.
         settled_ns = max(self.first_ns, *(source.at_ns for source in self.sources)) + whole_ns
         inbox = Inbox(self.depth)
@@ -69,17 +73,6 @@ class InboxTiming:
             worst_ns = max(worst_ns, end_ns - begin_ns - time_ns)
             begin_ns += self.period_ns
         return worst_ns
-
-    def _bound_cost_ns(self, time_ns: int, longest_ns: int) -> int:
-        """Return an upper bound for the cost of interrupts, but no more than `longest_ns`."""
-        cost_ns = 0
-        while cost_ns < longest_ns:
-            span_ns = time_ns + cost_ns
-            needed_ns = sum(s.service_ns * -(-span_ns // s.every_ns) for s in self.sources)
-            if needed_ns == cost_ns:
-                break
-            cost_ns = needed_ns
-        return min(cost_ns, longest_ns)
 
     @property
     def burst(self) -> Burst:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rack.backplane.layout import TickGrid
+from rack.backplane.words import Scheduler
 from rack.boards.timing.tasks import Budget
 
 Coupling = Literal["tight", "loose", "none"]
@@ -35,6 +36,8 @@ class BoardTiming:
         plan_within_ns: Longest time for a new plan that the config accepts. None without a limit.
         queues: Queues that it reads.
         phase: Tick of the first release.
+        scheduler: Scheduler of the executor.
+        is_urgent: Whether maximum urgency first runs the executor before others.
         reads: Ticks at which it reads messages, keyed by the board that writes them. Boards whose
             messages it reads in every cycle are left out.
     """
@@ -55,6 +58,8 @@ class BoardTiming:
     plan_within_ns: int | None
     queues: tuple[str, ...]
     phase: int
+    scheduler: Scheduler
+    is_urgent: bool
     reads: Mapping[str, TickGrid]
 
     @property

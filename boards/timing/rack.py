@@ -10,6 +10,7 @@ from math import gcd, prod
 from typing import Any, NamedTuple
 
 from rack.backplane.layout import TickGrid
+from rack.backplane.words import Scheduler
 from rack.boards.timing.chains import ParallelChains, list_chains
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, LevelTiming
@@ -189,32 +190,23 @@ class RackTiming:
     def _interrupted_ns(self) -> dict[str, int]:
         """Time that interrupts take from one computation of each task that serves an inbox.
 
-        The computation lasts longer if the task waits for its core, which depends on the handlers
-        of all tasks. Both times are raised until they agree. The cost of each inbox is bounded.
+        They take it from the release to the response, which depends on the handlers of all tasks.
+        Both times are raised until they agree. The cost of each inbox is bounded.
         """
-        lasting_ns = {task: self.find_busy_ns(task) for task in self.inboxes}
+        lasting_ns = dict.fromkeys(self.inboxes, 0)
         while True:
             taken_ns = {
                 task: inbox.compute_cost_ns(lasting_ns[task])
                 for task, inbox in self.inboxes.items()
             }
             before_ns = dict(lasting_ns)
-            for each in self._compute_responses(taken_ns) if taken_ns else ():
-                if each.task in taken_ns and each.response_ns is not None:
+            tasks = self._build_tasks(taken_ns) if taken_ns else ()
+            for each in compute_task_responses(tasks, self.context_switch_ns, self.tick_ns):
+                if each.response_ns and each.task in taken_ns:
                     computing_ns = each.response_ns - taken_ns[each.task]
                     lasting_ns[each.task] = max(before_ns[each.task], computing_ns)
             if lasting_ns == before_ns:
                 return taken_ns
-
-    def find_busy_ns(self, task: str) -> int:
-        """Return the budget of a task's cycle or plan in ns, without interrupts. 0 without one."""
-        board = self.boards[task.removesuffix(".planner")]
-        budget = board.budget
-        if budget is None:
-            return 0
-        if task != board.name:
-            return budget.plan_ns + budget.update_ns
-        return board.exchange_ns + budget.read_ns + budget.process_ns + budget.write_ns
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
@@ -252,6 +244,8 @@ class RackTiming:
             every_ns=board.every * self.tick_ns,
             phase_ns=board.phase * self.tick_ns,
             due_ns=board.due * self.tick_ns,
+            scheduler=board.scheduler,
+            is_critical=board.is_urgent,
             parts=_drop_empty_parts(
                 Part(Unit.EXCHANGE, board.exchange_ns),
                 Part(Unit.READ, budget.read_ns),
@@ -274,6 +268,7 @@ class RackTiming:
             ),
             within_cycles=board.within_cycles,
             due_ns=0,
+            scheduler=Scheduler.FIXED_PRIORITY,
             ceiling=ceiling,
         )
         return [executor, planner]
@@ -295,11 +290,7 @@ class RackTiming:
     @cached_property
     def responses(self) -> tuple[TaskResponse, ...]:
         """Worst-case response of every task that has a cost."""
-        return self._compute_responses(self._interrupted_ns)
-
-    def _compute_responses(self, taken_ns: Mapping[str, int]) -> tuple[TaskResponse, ...]:
-        """Return the responses if interrupts take `taken_ns` from a computation of each task."""
-        return compute_task_responses(self._build_tasks(taken_ns), self.context_switch_ns)
+        return compute_task_responses(self.tasks, self.context_switch_ns, self.tick_ns)
 
     @cached_property
     def loads(self) -> dict[int, float]:

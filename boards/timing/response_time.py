@@ -19,13 +19,14 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
-from itertools import pairwise
 from math import lcm
 from typing import Any
 
+from rack.backplane.words import Scheduler
 from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
+FIXED = Scheduler.FIXED_PRIORITY
 Load = tuple[int, int]
 """Demand of a task on its core: cost C of a job and period T, in the same unit."""
 
@@ -95,43 +96,44 @@ def _sum_released_work(until: int, load: Load) -> int:
 
 
 def _compute_scheduled_responses(
-    tasks: Sequence[TimedTask], context_switch_ns: int
+    tasks: Sequence[TimedTask], context_switch_ns: int, tick_ns: int | None
 ) -> dict[str, int]:
     """Return the exact response times of the tasks of one core, taken from their schedule.
 
-    In the worst case every job uses its whole budget, because under fixed priorities a shorter job
-    never delays another.
+    In the worst case every job uses its whole budget: by fixed priority or earliest deadline, a
+    shorter job never delays another. Under maximum urgency first, which exists in lockstep only,
+    every job does. By the processor demand criterion (Baruah, Rosier and Howell 1990), the earliest
+    deadline meets all deadlines if it does so from a common release on.
+
+    Args:
+        tasks: The tasks.
+        context_switch_ns: Time of one context switch.
+        tick_ns: Length of a tick. None if it does not matter.
 
     Returns:
-        The times in ns, keyed by task. Empty if the schedule is too long or not exact. It is not
-        exact if there are planners, which may plan at any release, if tasks of equal priority wait
-        at the same time, so that their order is not fixed, or if a job outlasts its period.
+        The times in ns, keyed by task. Empty if a job outlasts its period, which may delay any
+        other, or under fixed priorities if the schedule is too long or not exact. It is not exact
+        if there are planners, which may plan at any release, or tasks of equal priority, whose
+        order is not fixed.
     """
-    period = lcm(*(task.period_ns for task in tasks))
-    first = max(task.phase_ns for task in tasks)
-    until = first + 2 * period
-    has_planner = any(task.role == "planner" for task in tasks)
-    if has_planner or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
+    periods = {task.name: task.period_ns for task in tasks}
+    until = max(task.phase_ns for task in tasks) + 2 * lcm(*periods.values())
+    limit = MAX_JOBS // len(tasks) * min(periods.values())
+    fixed = [task for task in tasks if task.scheduler is FIXED]
+    has_planner = any(task.role == "planner" for task in fixed)
+    if fixed and (has_planner or until > limit or len({t.priority for t in fixed}) < len(fixed)):
         return {}
-    single_part_tasks = [merge_parts(task, context_switch_ns) for task in tasks]
-    chart = simulate_schedule(single_part_tasks, until + max(task.period_ns for task in tasks))
-    by_name = {task.name: task for task in tasks}
-    intervals = defaultdict[int, list[tuple[int, int]]](list)
-    responses = dict.fromkeys(by_name, 0)
+    until = min(until, limit)
+    merged = [merge_parts(task, context_switch_ns) for task in tasks]
+    chart = simulate_schedule(merged, until + max(periods.values()), tick_ns=tick_ns)
+    responses = dict.fromkeys(periods, 0)
     for job in chart.jobs:
         if job.release_ns >= until:
             continue
-        task = by_name[job.task]
-        if job.end_ns is None or job.end_ns > job.release_ns + task.period_ns:
+        if job.end_ns is None or job.end_ns > job.release_ns + periods[job.task]:
             return {}
         responses[job.task] = max(responses[job.task], job.end_ns - job.release_ns)
-        intervals[task.priority].append((job.release_ns, job.end_ns))
-    is_order_open = any(
-        later[0] < earlier[1]
-        for jobs in intervals.values()
-        for earlier, later in pairwise(sorted(jobs))
-    )
-    return {} if is_order_open else responses
+    return responses
 
 
 @dataclass(frozen=True)
@@ -167,23 +169,30 @@ class TaskResponse:
 
 
 def compute_task_responses(
-    tasks: Iterable[TimedTask], context_switch_ns: int = 0
+    tasks: Iterable[TimedTask], context_switch_ns: int = 0, tick_ns: int | None = None
 ) -> tuple[TaskResponse, ...]:
     """Compute the worst-case response of every task that has a cost.
 
     A job has two context switches, to it and from it (eq. 3.9), and its response includes both.
     Tasks of equal priority delay each other by whole jobs. Tasks under ordinary scheduling
-    (priority 0) take turns.
+    (priority 0) take turns. Tasks that are scheduled by deadline or urgency precede all these.
 
     The bound is exact for tasks of different priorities without blocking. It ignores that a job's
-    own parts may not be preemptible. On a core whose tasks have phases, the times come from the
-    simulated schedule if it is exact.
+    own parts may not be preemptible. The times come from the simulated schedule for tasks that are
+    scheduled by deadline or urgency, and if it is exact, on a core whose tasks have phases.
+
+    Args:
+        tasks: The tasks.
+        context_switch_ns: Time of one context switch.
+        tick_ns: Length of a tick. None if it does not matter.
     """
     busy = [task for task in tasks if task.cost_ns]
     exact: dict[str, int] = {}
-    for core in {task.core for task in busy if task.phase_ns}:
+    by_schedule = [task for task in busy if task.phase_ns or task.scheduler is not FIXED]
+    for core, rank in {(task.core, task.rank) for task in by_schedule}:
+        # Tasks that are preceded by these do not matter.
         exact |= _compute_scheduled_responses(
-            [task for task in busy if task.core == core], context_switch_ns
+            [t for t in busy if t.core == core and t.rank <= rank], context_switch_ns, tick_ns
         )
     demands = {t.name: (compute_job_ns(t, context_switch_ns), t.period_ns) for t in busy}
     responses = []
@@ -193,9 +202,17 @@ def compute_task_responses(
         blocking = compute_blocking_ns(task, others)
         bound = compute_response_time(
             job,
-            [demands[o.name] for o in others if o.priority >= max(task.priority, 1)],
+            [
+                demands[o.name]
+                for o in others
+                if (o.rank, -o.priority) <= (task.rank, -max(task.priority, 1))
+            ],
             blocking,
-            sharing=[demands[o.name] for o in others if not task.priority and not o.priority],
+            sharing=[
+                demands[o.name]
+                for o in others
+                if (task.priority, o.priority, o.rank) == (0, 0, task.rank)
+            ],
             horizon=MAX_DEADLINES * task.period_ns,
         )
         responses.append(
@@ -205,7 +222,7 @@ def compute_task_responses(
                 priority=task.priority,
                 job_ns=job,
                 blocking_ns=blocking,
-                response_ns=exact.get(task.name, bound),
+                response_ns=exact.get(task.name, bound if task.scheduler is FIXED else None),
                 deadline_ns=task.deadline_ns,
             )
         )

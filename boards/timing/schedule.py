@@ -1,4 +1,4 @@
-"""Simulated schedule of tasks under fixed priorities, as data for Gantt charts.
+"""Simulated schedule of tasks under their schedulers, as data for Gantt charts.
 
 The schedule follows the rules of the rack (backplane/clock/wake.py, boards/run/control_loop.py). A
 late task takes the newest release and skips the others. The next release of a planner comes after
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
-from rack.boards.timing.tasks import Part, TimedTask, Unit
+from rack.boards.timing.tasks import Part, TimedTask, Unit, Urgency, compute_urgency
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
 """For each task whose cycles differ, the sequences of parts that its cycles use in rotation."""
@@ -99,6 +99,7 @@ def simulate_schedule(
     until_ns: int,
     context_switch_ns: int = 0,
     variants: Variants | None = None,
+    tick_ns: int | None = None,
 ) -> Chart:
     """Compute the schedule of tasks from time 0.
 
@@ -110,14 +111,19 @@ def simulate_schedule(
         until_ns: End of the schedule.
         context_switch_ns: Time of one context switch.
         variants: Parts of tasks whose cycles differ. None if every task uses `TimedTask.parts`.
+        tick_ns: Length of a tick. Maximum urgency first compares jobs again in each tick, besides
+            releases and ends. None if it does not.
     """
     runners = [
         _TaskSimulation(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
         for task in tasks
     ]
     for core in {task.core for task in tasks}:
-        for _ in simulate_core([r for r in runners if r.task.core == core], 0, until_ns):
-            pass
+        of_core = [runner for runner in runners if runner.task.core == core]
+        step_ns = tick_ns or until_ns
+        for start_ns in range(0, until_ns, step_ns):
+            for _ in simulate_core(of_core, start_ns, min(start_ns + step_ns, until_ns)):
+                pass
     spans = sorted(
         (s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core)
     )
@@ -126,10 +132,6 @@ def simulate_schedule(
         key=lambda job: (job.release_ns, job.task),
     )
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
-
-
-Urgency = tuple[Any, ...]
-"""Key of a ready task. The task with the smallest key runs."""
 
 
 class CoreTask(Protocol):
@@ -203,8 +205,18 @@ class _TaskSimulation:
         """Return the key by which ready tasks are sorted. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
+        release = self._release if self._steps else self._find_release(now_ns)
+        deadline_ns = release + self.task.period_ns
+        left_ns = sum(step.time_ns for step in self._steps or self.task.parts) - self._spent_ns
+        urgency = compute_urgency(
+            self.task.scheduler,
+            priority,
+            deadline_ns,
+            deadline_ns - now_ns - left_ns,
+            is_critical=self.task.is_critical,
+        )
         # Once begun, a part that is not preemptible precedes other tasks of equal priority.
-        return -priority, not is_locked, self.ready_at, self.task.name
+        return *urgency, not is_locked, self.ready_at, self.task.name
 
     def run_step(self, now_ns: int, until_ns: int) -> int:
         """Run the task from `now_ns` to the end of a part or `until_ns`, and return that time."""
@@ -243,15 +255,18 @@ class _TaskSimulation:
         Executors skip the releases that have expired.
         """
         every = self.task.every_ns
-        first = self.task.phase_ns
-        newest = first + (now_ns - first) // every * every
-        self._release = max(self.ready_at, newest - self._slack_ns)
+        self._release = self._find_release(now_ns)
         if self.task.role != "planner":
             self._ends |= dict.fromkeys(range(self.ready_at, self._release, every))
         self._slack_ns = self.task.period_ns - every
         parts = self._variants[self._release // every % len(self._variants)]
         steps = [part for part in parts if part.time_ns]
         self._steps = [*self._switch, *steps, *self._switch]
+
+    def _find_release(self, now_ns: int) -> int:
+        """Return the release that a job takes which begins at a time."""
+        newest = now_ns - (now_ns - self.task.phase_ns) % self.task.every_ns
+        return max(self.ready_at, newest - self._slack_ns)
 
     def _end_job(self, now_ns: int) -> None:
         """Record the end of the present job and determine the release of the next one."""

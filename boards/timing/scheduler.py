@@ -1,38 +1,12 @@
-"""Preemptive schedulers of a core: fixed priority, earliest deadline first, maximum urgency first.
-
-Maximum urgency first is CHIMERA's: critical tasks precede others, then the least laxity counts (the
-time that a job can still wait before it misses its deadline), then the user's priority. D. B.
-Stewart and P. K. Khosla, *Real-Time Scheduling of Sensor-Based Control Systems*, IEEE Workshop on
-Real-Time Operating Systems and Software (1991).
-"""
+"""A simulated core, whose jobs compete for it under their schedulers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from rack.backplane.words import Scheduler
-from rack.boards.timing.schedule import Urgency, simulate_core
-
-
-def compute_urgency(
-    scheduler: Scheduler, priority: int, deadline_ns: int, laxity_ns: int, *, is_critical: bool
-) -> tuple[int, ...]:
-    """Return the urgency of a job under a scheduler, as a key of which the smallest runs first.
-
-    Args:
-        scheduler: Scheduler of the job's task.
-        priority: Fixed priority of the task.
-        deadline_ns: Deadline of the job.
-        laxity_ns: Time from the earliest possible end of the job to its deadline.
-        is_critical: Whether the task is critical.
-    """
-    match scheduler:
-        case Scheduler.FIXED_PRIORITY:
-            return -scheduler, -priority
-        case Scheduler.EARLIEST_DEADLINE_FIRST:
-            return -scheduler, deadline_ns, -priority
-        case Scheduler.MAXIMUM_URGENCY_FIRST:
-            return -scheduler, not is_critical, laxity_ns, -priority
+from rack.boards.timing.schedule import simulate_core
+from rack.boards.timing.tasks import Urgency, compute_urgency
 
 
 @dataclass

@@ -1,10 +1,12 @@
-"""Tasks of the timing model: unit functions of known length, released periodically."""
+"""Tasks of the timing model: unit functions of known length, released periodically, by urgency."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal
+
+from rack.backplane.words import Scheduler
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ class TimedTask:
             and every task that has no higher priority than the executor (eq. 3.10).
         phase_ns: Time of the first release.
         due_ns: Time from a release within which its job must end. 0 for `period_ns`.
+        scheduler: Its scheduler.
+        is_critical: Whether maximum urgency first runs it before others.
     """
 
     name: str
@@ -95,6 +99,14 @@ class TimedTask:
     ceiling: int = 0
     phase_ns: int = 0
     due_ns: int = 0
+    scheduler: Scheduler = Scheduler.FIXED_PRIORITY
+    is_critical: bool = False
+
+    @property
+    def rank(self) -> tuple[int, bool]:
+        """Key that tasks of one scheduler share. Those with a smaller one precede others."""
+        is_behind = self.scheduler is Scheduler.MAXIMUM_URGENCY_FIRST and not self.is_critical
+        return -self.scheduler, is_behind
 
     @property
     def period_ns(self) -> int:
@@ -103,10 +115,40 @@ class TimedTask:
 
     @property
     def deadline_ns(self) -> int:
-        """Time in ns from a release to the deadline of its job."""
+        """Time in ns from a release to the deadline of its job. Schedulers go by the period."""
         return self.due_ns or self.period_ns
 
     @property
     def cost_ns(self) -> int:
         """Processor time of one job in ns, without context switches."""
         return sum(part.time_ns for part in self.parts)
+
+
+Urgency = tuple[Any, ...]
+"""Key of a ready job. The job with the smallest key runs."""
+
+
+def compute_urgency(
+    scheduler: Scheduler, priority: int, deadline_ns: int, laxity_ns: int, *, is_critical: bool
+) -> Urgency:
+    """Return the urgency of a job under a scheduler.
+
+    Maximum urgency first is CHIMERA's: critical tasks precede others, then the least laxity counts
+    (the time that a job can still wait before it misses its deadline), then the user's priority.
+    D. B. Stewart and P. K. Khosla, *Real-Time Scheduling of Sensor-Based Control Systems*, IEEE
+    Workshop on Real-Time Operating Systems and Software (1991).
+
+    Args:
+        scheduler: Scheduler of the job's task.
+        priority: Fixed priority of the task.
+        deadline_ns: Deadline of the job.
+        laxity_ns: Time from the earliest possible end of the job to its deadline.
+        is_critical: Whether the task is critical.
+    """
+    match scheduler:
+        case Scheduler.FIXED_PRIORITY:
+            return -scheduler, -priority
+        case Scheduler.EARLIEST_DEADLINE_FIRST:
+            return -scheduler, deadline_ns, -priority
+        case Scheduler.MAXIMUM_URGENCY_FIRST:
+            return -scheduler, not is_critical, laxity_ns, -priority

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import numpy as np
-
 from rack.backplane.layout import TaskSpec
 from rack.boards.config import build_rack_timing
 from rack.boards.config.timing import subtract_interrupts
@@ -230,10 +228,7 @@ def _judge_tasks(
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             deadline_ns = compute_due_ns(rack, cycles.task)
-            # A cycle that the trace marks as missed counts as later than its deadline, even if its
-            # measured response is shorter.
-            least_ns = np.where(trace_times.find_missed_cycles(rows), deadline_ns + 1, 0)
-            response_ns = np.maximum(trace_times.compute_response_ns(rows), least_ns)
+            response_ns = trace_times.compute_response_ns(rows)
             worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)
             meaning = "measured response <= deadline"
             yield EquationVerdict(RESPONSE_TIME, name, worst_ns, "<=", deadline_ns, meaning)

@@ -63,7 +63,7 @@ def compute_task_times(
     is_lockstep: bool,
     *,
     stretches: np.ndarray,
-    due_ns: int | None = None,
+    due_ns: int,
     parts_ns: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Document:
     """Return the times in ms of a task's cycles, as in eq. 3.5: R = t_exec + t_comm + t_residual.
@@ -79,11 +79,10 @@ def compute_task_times(
         is_lockstep: Whether the run was in lockstep.
         stretches: Number of the recorded stretch of each cycle, shape (n,). Gaps are measured only
             between cycles of the same stretch.
-        due_ns: Time from a release to the deadline. Defaults to the time slice.
+        due_ns: Time from a release to the deadline.
         parts_ns: t_exec and t_comm of each cycle. Defaults to the traced times on the wall clock.
     """
     slice_ns = task.slice * period_ns
-    due_ns = due_ns or slice_ns
     gaps = compute_gaps_ns(cycles, stretches)
     execution, communication = parts_ns or (
         compute_execution_ns(cycles),
@@ -108,7 +107,6 @@ def compute_task_times(
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * MS_PER_NS,
-        "due_ms": due_ns * MS_PER_NS,
         "execution_ms": compute_distribution(execution * MS_PER_NS),
         "communication_ms": compute_distribution(communication * MS_PER_NS),
         "processor_ms": compute_distribution(cycles["processor_ns"] * MS_PER_NS),

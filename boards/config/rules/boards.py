@@ -219,10 +219,6 @@ def check_rates(wiring: Wiring) -> Mistakes:
         if board.phase >= every:
             why = f"must be less than the board's period: 0 to {every - 1} ticks"
             yield Mistake(f"board.{name}.phase", board.phase, why)
-        cycle_ms = every * wiring.config.clock.period_ms
-        if board.budget is not None and (board.budget.send_within_ms or 0.0) > cycle_ms:
-            why = f"must be at most the board's period, {cycle_ms:g} ms"
-            yield Mistake(f"board.{name}.budget.send_within_ms", board.budget.send_within_ms, why)
 
 
 def check_polling(wiring: Wiring) -> Mistakes:

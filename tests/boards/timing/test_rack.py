@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from rack.backplane.words import Scheduler
 from rack.boards.timing.chains import format_names
 from rack.boards.timing.forecast import NO_BUDGET, Forecast
 from rack.boards.timing.level import BoardTiming
@@ -21,6 +22,7 @@ FIGURE_3 = BoardTiming(
     above=(),
     coupling="tight",
     every=3,
+    due=3,
     within_cycles=3,
     core=1,
     priority=80,
@@ -32,6 +34,8 @@ FIGURE_3 = BoardTiming(
     plan_within_ns=None,
     queues=(),
     phase=0,
+    scheduler=Scheduler.FIXED_PRIORITY,
+    is_urgent=False,
     reads={},
 )
 

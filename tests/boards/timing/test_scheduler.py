@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from rack.backplane.words import Scheduler
+from rack.boards.timing.response_time import compute_task_responses
 from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.scheduler import CoreJob, SimulatedCore
 from rack.boards.timing.tasks import Part, TimedTask, Unit
@@ -24,6 +25,12 @@ class Load(NamedTuple):
     cost: int
     priority: int
     is_critical: bool = False
+    due: int = 0
+    scheduler: Scheduler = FIXED
+
+    @property
+    def deadline(self) -> int:
+        return self.due or self.period
 
     def release(self, now: int, scheduler: Scheduler) -> CoreJob:
         due = now + self.period
@@ -31,12 +38,18 @@ class Load(NamedTuple):
         return CoreJob(self.name, now, *order, now, due, self.cost)
 
 
-def run(loads: Sequence[Load], scheduler: Scheduler, until: int) -> dict[tuple[str, int], int]:
+def run(
+    loads: Sequence[Load], scheduler: Scheduler | None, until: int
+) -> dict[tuple[str, int], int]:
     """Run tasks on a core, and return the end of each job by task and release."""
     core = SimulatedCore()
     ends = {}
     for now in range(until):
-        core.jobs += [load.release(now, scheduler) for load in loads if now % load.period == 0]
+        core.jobs += [
+            load.release(now, scheduler or load.scheduler)
+            for load in loads
+            if now % load.period == 0
+        ]
         while (job := core.run_until(now + 1)) is not None:
             ends[job.task, job.release] = core.now_ns
     return ends
@@ -51,15 +64,30 @@ def draw(rng: random.Random, left: float) -> Iterator[Load]:
             yield Load(f"t{number}", period, cost, 9 - number, rng.random() < 0.5)
 
 
+def build_tasks(loads: Sequence[Load]) -> list[TimedTask]:
+    return [
+        TimedTask(
+            name=load.name,
+            board=load.name,
+            role="executor",
+            core=0,
+            priority=load.priority,
+            every_ns=load.period,
+            parts=(Part(Unit.PROCESS, load.cost),),
+            due_ns=load.due,
+            scheduler=load.scheduler,
+            is_critical=load.is_critical,
+        )
+        for load in loads
+    ]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_fixed_priorities_give_the_schedule_of_the_gantt_chart(seed: int) -> None:
     # Up to this share rate-monotonic priorities meet all deadlines (Liu and Layland).
     loads = list(draw(random.Random(seed), 0.69))
     until = lcm(*(load.period for load in loads))
-    tasks = []
-    for name, period, cost, priority, _ in loads:
-        parts = (Part(Unit.PROCESS, cost),)
-        tasks.append(TimedTask(name, name, "executor", 0, priority, period, parts))
+    tasks = build_tasks(loads)
     chart = simulate_schedule(tasks, until)
     expected = {(job.task, job.release_ns): job.end_ns for job in chart.jobs}
     assert run(loads, FIXED, until) == expected
@@ -134,3 +162,91 @@ def test_a_change_of_the_scheduler_acts_on_a_job_that_has_begun() -> None:
     core.jobs[1].scheduler = URGENCY
     ended = core.run_until(60), core.run_until(60)
     assert [job.task for job in ended if job] == ["second", "first"]
+
+
+def draw_scheduled(rng: random.Random, *schedulers: Scheduler) -> list[Load]:
+    """Draw tasks that use about the whole core, some with deadlines before their periods."""
+    loads = []
+    for number, period in enumerate(rng.sample((4, 5, 6, 8, 10, 12, 15, 20), rng.randint(2, 4))):
+        cost = rng.randint(1, max(1, period // 2))
+        due = rng.choice((0, rng.randint(cost, period)))
+        is_critical = rng.random() < 0.5
+        scheduler = rng.choice(schedulers)
+        loads.append(Load(f"t{number}", period, cost, 9 - number, is_critical, due, scheduler))
+    return loads
+
+
+def find_late(loads: Sequence[Load]) -> set[str]:
+    """Return the tasks that miss a deadline on a core on which all are released together."""
+    until = 2 * lcm(*(load.period for load in loads))
+    ends = run(loads, None, until)
+    return {
+        load.name
+        for load in loads
+        for release in range(0, until - load.period, load.period)
+        if ends.get((load.name, release), until) > release + load.deadline
+    }
+
+
+def find_failing(loads: Sequence[Load]) -> set[str]:
+    """Return the tasks that may be late, as `rack check` says."""
+    return {
+        each.task for each in compute_task_responses(build_tasks(loads), 0, 1) if not each.holds
+    }
+
+
+def meets_demand(loads: Sequence[Load]) -> bool:
+    """Apply the processor demand criterion: jobs whose periods end by a time need no more."""
+    return all(
+        sum(end // load.period * load.cost for load in loads) <= end
+        for end in range(1, 2 * lcm(*(load.period for load in loads)))
+    )
+
+
+def test_the_verdict_on_earliest_deadline_first_is_that_of_demand_and_schedule() -> None:
+    rng = random.Random(49)
+    fits = []
+    for _ in range(300):
+        loads = draw_scheduled(rng, EARLIEST)
+        found = find_failing(loads)
+        assert bool(found) == bool(find_late(loads)), loads
+        whole = [load._replace(due=0) for load in loads]
+        assert bool(find_failing(whole)) == bool(find_late(whole)) == (not meets_demand(loads))
+        fits.append(not found)
+    assert 30 < sum(fits) < 270
+
+
+@pytest.mark.parametrize("schedulers", [(URGENCY,), tuple(Scheduler)], ids=["urgency", "all"])
+def test_tasks_that_fit_under_their_schedulers_are_never_late(
+    schedulers: tuple[Scheduler, ...],
+) -> None:
+    rng = random.Random(50)
+    fits = []
+    for _ in range(300):
+        loads = draw_scheduled(rng, *schedulers)
+        late = find_late(loads)
+        failing = find_failing(loads)
+        assert late <= failing, loads
+        assert bool(late) == bool(failing), loads
+        fits.append(not late)
+    assert 30 < sum(fits) < 270
+
+
+def test_critical_tasks_fit_whatever_the_others_need() -> None:
+    assert find_failing([load._replace(scheduler=URGENCY) for load in OVERLOAD]) == {
+        "fast",
+        "medium",
+    }
+
+
+@pytest.mark.parametrize("scheduler", Scheduler)
+def test_a_chart_shows_the_schedule_of_the_scheduler(scheduler: Scheduler) -> None:
+    rng = random.Random(51)
+    drawn = [draw_scheduled(rng, scheduler) for _ in range(60)]
+    fitting = [loads for loads in drawn if not find_late(loads)]
+    assert len(fitting) > 5
+    for loads in fitting:
+        until = lcm(*(load.period for load in loads))
+        chart = simulate_schedule(build_tasks(loads), until, tick_ns=1)
+        ends = {(job.task, job.release_ns): job.end_ns for job in chart.jobs}
+        assert ends == run(loads, None, until), loads

@@ -36,6 +36,7 @@ class Schedule:
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         timing = build_rack_timing(config, layout)
         self.tasks = timing.tasks
+        self._tick_ns = timing.tick_ns
         self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
         # Show the frames of a static schedule up to the last one that differs from earlier ones.
         alike = [each.frames[0] for each in compute_core_frames(timing)]
@@ -77,7 +78,7 @@ class Schedule:
                 f" at most {MAX_SIMULATED_CYCLES} are simulated",
                 2,
             )
-        chart = simulate_schedule(self.tasks, until_ns, self.switch_ns)
+        chart = simulate_schedule(self.tasks, until_ns, self.switch_ns, tick_ns=self._tick_ns)
         shown = chart.cut_window(start_ns - skipped_ns, end_ns - skipped_ns)
         lanes = build_lanes(self.tasks)
         detail = PatternDetail(gap_ns=2 * self.switch_ns)

@@ -134,5 +134,5 @@ def test_a_restarted_board_continues_from_its_status(network: BlockNetwork) -> N
     assert restarted.wires == network.wires
     for one in (network, restarted):
         one.values["arm.torque"] = 3.0
-        one.compute(PERIOD_S)
+        one.compute_blocks(PERIOD_S)
     assert restarted.values == network.values
