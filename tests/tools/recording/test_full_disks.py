@@ -30,7 +30,7 @@ from tests.tools.recording.struck_recorders import (
 
 pytestmark = pytest.mark.thorough
 
-FULL_S = 20.0
+FULL_S = 40.0
 """Bound of the end of a run whose disk is full: well below what it would last."""
 
 

@@ -23,7 +23,7 @@ from rack.levels.systems.force.network_server import SILENT_S, NetworkServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.tools.viewer.window import find_free_port
 from tests.levels.systems.force.test_client import CONTEXT
-from tests.processes import in_thread, wait_until
+from tests.processes import BOUND_S, in_thread, wait_until
 
 HOST = "127.0.0.1"
 SCRIPT = """
@@ -195,7 +195,8 @@ def test_a_flood_waits_and_is_reported_once(capfd: pytest.CaptureFixture[str]) -
             for _ in range(1000):
                 flooding.sendall(100 * request)
             pytest.fail("the server takes all requests")
-        assert len(side.requests) == 5
+        # A slow machine takes the first ones after the flood.
+        wait_until(lambda: len(side.requests) == 5)
         # The rack is served meanwhile, and what waits is taken in order.
         waits = len(side.waits)
         side.places = 8
@@ -208,9 +209,12 @@ def test_a_second_client_is_refused_until_the_first_is_silent(
 ) -> None:
     with serving(RackSide(False)) as served, served.connect() as first:
         first.recv(1)
+        # On a slow machine the second one may come late.
+        silent_s = "rack.levels.systems.force.network_server.SILENT_S"
+        monkeypatch.setattr(silent_s, BOUND_S)
         with pytest.raises(LevelError, match="the server has another client"):
             run_client(served.address, script)
-        monkeypatch.setattr("rack.levels.systems.force.network_server.SILENT_S", 0.0)
+        monkeypatch.setattr(silent_s, 0.0)
         run_client(served.address, script)
         wait_until(lambda: served.is_done)
     out = capfd.readouterr().out
