@@ -258,7 +258,7 @@ class LevelCommander:
             if is_over or not words[Block.TAKE_OVER]:
                 break
         why = "no standby has the state of the active copy; see `rack status`"
-        return replace(reply, fate="refused", objection=why)
+        return replace(reply, fate="refused", taken_up=reply.given, objection=why)
 
     def _poll_run(self, about: str, awaited: str) -> Iterator[bool]:
         """Check the rack repeatedly, and yield each time whether the run is over.

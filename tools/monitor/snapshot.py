@@ -137,7 +137,7 @@ class Snapshot:
     peers: tuple[PeerRow, ...]
     imports: tuple[ImportRow, ...]
     exports: tuple[ExportRow, ...]
-    standbys: tuple[ReplicatedTask, ...]
+    standbys: tuple[ReplicatedTask, ...] = ()
 
 
 class RackMonitor:

@@ -27,17 +27,14 @@ CASES: dict[str, dict[str, Any]] = {
     "two readers": {"readers": 2, "words": COARSE},
     "lost serials": {"messages": 4, "losses": 1, "words": COARSE},
     "forged messages": {"messages": 4, "forgeries": 1, "words": COARSE},
-    "a take-over": {"messages": 4, "kills": 0, "stops": 1, "words": COARSE},
-    "a take-over and a kill in it": {"messages": 3, "kills": 1, "stops": 1, "words": COARSE},
-    "two reads and a take-over": {
-        "messages": 3,
-        "kills": 0,
-        "stops": 1,
-        "reads": 2,
-        "words": COARSE,
-    },
 }
 """What may happen, by name, while five messages go through four slots."""
+TAKE_OVERS: dict[str, dict[str, Any]] = {
+    "a take-over": {"kills": 0},
+    "a take-over and a kill": {"kills": 1},
+    "two reads and a take-over": {"kills": 0, "reads": 2},
+}
+"""What may happen while a stopped writer is replaced, and still stores a message."""
 NOT_PUBLISHED = "a reader returns a message that was not published"
 NOT_BAD = "a reader takes a published message for a bad one"
 NO_CLAIM = "a message is published without the valid claim"
@@ -114,6 +111,19 @@ def test_the_protocol_holds_in_every_state(memory: Memory, case: str) -> None:
     exploration = found(memory=memory, **CASES[case])
     assert (exploration.violation, exploration.steps) == ("", ())
     assert exploration.states > 5_000
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", TAKE_OVERS)
+@pytest.mark.parametrize(
+    ("memory", "messages"), [(Memory.SC, 3), (Memory.TSO, 1), (Memory.WEAK, 2)]
+)
+def test_the_protocol_holds_in_every_state_of_a_take_over(
+    memory: Memory, messages: int, case: str
+) -> None:
+    exploration = found(memory=memory, messages=messages, stops=1, words=COARSE, **TAKE_OVERS[case])
+    assert (exploration.violation, exploration.steps) == ("", ())
+    assert exploration.states > 1_000
 
 
 @pytest.mark.slow

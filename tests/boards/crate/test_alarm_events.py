@@ -47,6 +47,7 @@ KINDS = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
     Alarm.REJOINED: "recovery",
+    Alarm.TAKEN_OVER: "recovery",
     Alarm.FLOWS: "recovery",
     Alarm.DEMAND: "reaction",
     Alarm.BRAKES_CLOSED: "reaction",

@@ -294,3 +294,11 @@ def test_a_level_that_is_not_deterministic_cannot_be_compared(
     )
     assert (done.returncode, line in done.stderr) == (2, True), done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_an_operator_switches_without_a_gap(config: MakeConfig, plain: str) -> None:
+    commands = 'command=[{level="wave",what="switch",tick=50},{level="wave",what="switch",tick=90}]'
+    digest, task, alarms = run(config(STANDBY, commands, text=PLANNED))
+    assert (task.active.name, task.reason, task.since_tick) == ("wave", "commanded", 90)
+    assert task.hand_overs == 2
+    assert (digest, alarms) == (plain, [])
