@@ -8,6 +8,7 @@ with the last index running fastest. Log time is simulated time.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from heapq import merge
 from operator import attrgetter
@@ -109,9 +110,10 @@ class MailboxEncoder:
 
     def encode(self, box: MailboxSpec, rows: np.ndarray) -> Iterator[RosMessage]:
         """Yield the messages of a mailbox, oldest first. The type is declared before the first."""
-        type_name = name_type(box.message)
+        # Messages of one name may have different fields, as those of bus adapters do.
+        type_name = name_type(box.name)
         head = ["std_msgs/Header header", *(f"int64 message_{name}" for name in HEAD)]
-        definition = self._declare(box.message, box.fields, head)
+        definition = self._declare(box.name, box.fields, head)
         header, _ = self.store.generate_msgdef(HEADER, ros_version=2)
         self.definitions[type_name] = f"{definition}{SEPARATOR}\nMSG: std_msgs/Header\n{header}"
         topic = RosTopic(f"/mailbox/{convert_name(box.name)}", type_name)
@@ -120,7 +122,7 @@ class MailboxEncoder:
             ticks = block["tick"].tolist()
             headers = [self._encoder.build_header(tick) for tick in ticks]
             columns = [headers, *(block[name].tolist() for name in HEAD)]
-            messages = self._build(box.message, box.fields, block["message"], columns)
+            messages = self._build(box.name, box.fields, block["message"], columns)
             for tick, message in zip(ticks, messages, strict=True):
                 data = self.store.serialize_cdr(message, type_name)
                 yield RosMessage(self._encoder.compute_time(tick), topic, data)
@@ -129,7 +131,7 @@ class MailboxEncoder:
         """Register the type of a message, and the types of its groups.
 
         Args:
-            message: Name of the message, as in `world_model`.
+            message: Name of the mailbox, or of the group: that of the mailbox and the field.
             fields: Its fields.
             head: Definitions of fields that come first.
 
@@ -161,7 +163,7 @@ class MailboxEncoder:
         """Build messages of a declared type.
 
         Args:
-            message: Name of the message.
+            message: Name of the mailbox or group, as in `_declare`.
             fields: Its fields.
             records: Values of the fields, shape (messages,).
             head: Values of the fields before them, each a list with one value for each message.
@@ -184,5 +186,6 @@ class MailboxEncoder:
 
 
 def name_type(message: str) -> str:
-    """Return the name of the type of a message: `rack_msgs/msg/WorldModel` for `world_model`."""
-    return f"rack_msgs/msg/{''.join(word.capitalize() for word in message.split('_'))}"
+    """Return the name of the type of a mailbox: `rack_msgs/msg/WorldModel` for `world.model`."""
+    words = re.split(r"[\W_]+", message)
+    return f"rack_msgs/msg/{''.join(word.capitalize() for word in words)}"

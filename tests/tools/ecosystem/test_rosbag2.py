@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from rack.backplane.layout import FieldSpec
-from rack.boards.config import load
+from rack.backplane.mailbox.history import build_row_dtype
+from rack.boards.config import load, resolve_layout
 from rack.levels.robot.engine import view_state
 from rack.tools.console.answer import Failure
-from rack.tools.ecosystem.rosbag2 import export_bag
+from rack.tools.ecosystem.ros_messages import RosEncoder
+from rack.tools.ecosystem.rosbag2 import MailboxEncoder, export_bag
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 from tests.tools.recordings import recorded
@@ -199,6 +202,21 @@ def test_the_folder_is_a_bag_for_rosbags(bag: Path, messages: Messages) -> None:
         ):
             message: Any = reader.deserialize(raw, connection.msgtype)
             assert message.position.tolist() == other.position
+
+
+def test_messages_of_one_name_may_have_different_fields(small: Path) -> None:
+    config = load(small, [])
+    layout = resolve_layout(config)
+    mailboxes = MailboxEncoder(RosEncoder(layout, config))
+    boxes = [layout.find_mailbox(f"{level}.status") for level in ("upper", "lower")]
+    same = [replace(box, message="exchange", fields=box.fields[n:]) for n, box in enumerate(boxes)]
+    for box in same:
+        rows = np.zeros(2, build_row_dtype(box))
+        assert len([*mailboxes.encode(box, rows)]) == 2
+    assert {*mailboxes.definitions} == {
+        "rack_msgs/msg/UpperStatus",
+        "rack_msgs/msg/LowerStatus",
+    }
 
 
 def test_a_run_without_messages_is_refused(small: Path, tmp_path: Path) -> None:
