@@ -56,7 +56,7 @@ def with_own_name(command: str, own: str) -> str:
     """Return a command for a rack of its own name, on a machine that may be too busy, and short."""
     command, hash_sign, remark = command.partition("  #")
     command = re.sub(
-        rf"\brack (status|step|stop|inject|watch|mailbox|command) ({NAMES})\b",
+        rf"\brack (status|step|stop|estop|inject|watch|mailbox|command) ({NAMES})\b",
         rf"rack \1 {own}",
         command,
     )

@@ -140,9 +140,6 @@ def run(
     from rack.tools.monitor.display import open_display
     from rack.tools.report.stored import print_report
 
-    if entries is not None:
-        from rack.tools.recording.entries import load_entries
-
     rack_config = validate(tables_read)
     if step and rack_config.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
@@ -158,6 +155,8 @@ def run(
         stack.enter_context(INTERRUPT.stop_orderly(unfinished=unfinished))
         with open_display(as_json, sys.stderr) as display:
             if entries is not None:
+                from rack.tools.recording.entries import load_entries
+
                 begins = Beginning(crate=crate, entries=load_entries(rack_config, entries))
             result = run_rack(
                 rack_config,
