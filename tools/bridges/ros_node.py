@@ -81,6 +81,8 @@ class RosNode:
             else:
                 for key, value in SETTINGS.items():
                     config.insert_json5(key, encode_json(value))
+            # Zenoh would leave its segments behind.
+            config.insert_json5("transport/shared_memory/enabled", "false")
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise Failure(f"zenoh: {' '.join(str(error).split())}") from None

@@ -48,6 +48,7 @@ def main() -> None:
         "mode": "peer",
         "listen/endpoints": [sys.argv[1]],
         "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
