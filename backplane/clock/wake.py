@@ -239,7 +239,8 @@ class NextCycle:
     def wait_for_tick(self, tick: int) -> None:
         """In lockstep, wait in the middle of a cycle until the clock has begun `tick`.
 
-        The clock first gives the releases of that tick. The wait also ends with the run.
+        The clock first gives the releases of that tick. The wait also ends with the run, and then
+        `Block.FINISH` is still set.
         """
         block = self._block
         block[Block.FINISH] = tick

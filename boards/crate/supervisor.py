@@ -263,11 +263,15 @@ class Supervisor:
         )
 
     def _is_cycling(self, name: str) -> bool:
-        """Return True if a board has not finished its last released cycle and is not lost."""
+        """Return True if a board has not finished its last released cycle and is not lost.
+
+        A cycle that takes simulated time until after the run remains unfinished.
+        """
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
         block = self.segment.get_block(name)
-        return block[Block.DONE] < block[Block.RELEASED] and not block[Block.LOST]
+        is_over = block[Block.LOST] or block[Block.FINISH]
+        return block[Block.DONE] < block[Block.RELEASED] and not is_over
 
     @property
     def _is_stopped(self) -> bool:

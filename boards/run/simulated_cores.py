@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rack.backplane.clock.lockstep import LockstepDriver
-from rack.backplane.words import Block, Run, Scheduler, System
+from rack.backplane.words import Block, Scheduler
 from rack.boards.timing.scheduler import CoreJob, SimulatedCore
 from rack.boards.wiring import Scheduling
 
@@ -41,8 +41,7 @@ class CoreStep:
         task = self._task
         task.block[Block.COMPUTING_NS] = self._cost_ns + end_ns - begin_ns
         task.next_cycle.wait_for_tick(UNKNOWN)
-        is_over = task.words[System.STATE] == Run.STOPPED
-        return end_ns if is_over else task.block[Block.COMPUTING_NS]
+        return task.block[Block.COMPUTING_NS]
 
 
 class SimulatedCores:
