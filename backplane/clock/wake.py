@@ -239,8 +239,7 @@ class NextCycle:
     def wait_for_tick(self, tick: int) -> None:
         """In lockstep, wait in the middle of a cycle until the clock has begun `tick`.
 
-        The clock first gives the releases of that tick. The wait also ends with the run, and then
-        `Block.FINISH` is still set.
+        The clock first gives the releases of that tick. The wait also ends with the run.
         """
         block = self._block
         block[Block.FINISH] = tick

@@ -263,15 +263,11 @@ class Supervisor:
         )
 
     def _is_cycling(self, name: str) -> bool:
-        """Return True if a board has not finished its last released cycle and is not lost.
-
-        A cycle that takes simulated time until after the run remains unfinished.
-        """
+        """Return True if a board has not finished its last released cycle and is not lost."""
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
         block = self.segment.get_block(name)
-        is_over = block[Block.LOST] or block[Block.FINISH]
-        return block[Block.DONE] < block[Block.RELEASED] and not is_over
+        return block[Block.DONE] < block[Block.RELEASED] and not block[Block.LOST]
 
     @property
     def _is_stopped(self) -> bool:

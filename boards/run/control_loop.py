@@ -95,9 +95,6 @@ class VirtualControlLoop(Task):
         watch.read_ns = monotonic_ns()
         self.process(tick)
         ended = self.end_computing(tick, deadline) if self.simulated.steps else None
-        if self.block[Block.FINISH]:
-            # The run is over before the end of the cycle.
-            return
         watch.process_ns = monotonic_ns()
         in_time = self.write_command_and_status(tick, ended or watch.find_late_tick(deadline))
         watch.end_ns = monotonic_ns()
@@ -201,8 +198,6 @@ class PlannerLoop(Task):
         self.planner.plan(tick)
         self.faults.burn_time(tick)
         ended = self.end_computing(tick, deadline) if self.simulated.steps else None
-        if self.block[Block.FINISH]:
-            return
         if self._critical_priority:
             # At this priority the executor cannot preempt the update of the plan.
             set_priority(self._critical_priority)

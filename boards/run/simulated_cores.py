@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rack.backplane.clock.lockstep import LockstepDriver
-from rack.backplane.words import Block, Scheduler
+from rack.backplane.words import Block, Run, Scheduler, System
 from rack.boards.timing.scheduler import CoreJob, SimulatedCore
 from rack.boards.wiring import Scheduling
 
@@ -41,6 +41,9 @@ class CoreStep:
         task = self._task
         task.block[Block.COMPUTING_NS] = self._cost_ns + end_ns - begin_ns
         task.next_cycle.wait_for_tick(UNKNOWN)
+        if task.words[System.STATE] == Run.STOPPED:
+            # The job is late if its deadline is not after the run.
+            return (task.words[System.TICK] + 1) * task.simulated.clock_ns
         return task.block[Block.COMPUTING_NS]
 
 
