@@ -44,8 +44,8 @@ class Copy:
         pid: Its process.
         is_active: Whether it writes the mailboxes of the task.
         is_lost: Whether its process was lost and has not returned yet.
-        aligned_since: Tick since which its messages equal those of the active copy. None while they
-            differ, and for the active copy.
+        aligned_since: Tick since which its messages equal those of the active copy. None before the
+            first comparison, while they differ, and for the active copy.
     """
 
     name: str
@@ -121,7 +121,7 @@ def _read_task(segment: Segment, name: str) -> ReplicatedTask:
 
 
 def _describe_copy(copy: Copy) -> str:
-    """Return the state of a copy in one word."""
+    """Return the state of a copy."""
     if copy.is_active:
         return "active"
-    return "lost" if copy.is_lost else "differs" if copy.aligned_since is None else "ready"
+    return "lost" if copy.is_lost else "not ready" if copy.aligned_since is None else "ready"
