@@ -131,8 +131,6 @@ def find_subject(text: str, settings: Sequence[str], out: Path | None) -> Subjec
             raise Failure(f"--set {settings[0]}: the config of a run cannot be changed: {text}", 2)
         run = TracedRun(Recording(path))
         return Subject(run.config, run.recording.layout, run, out or path)
-    if "/" in text and not path.exists():
-        raise Failure(f"{text}: there is no run folder and no config of this name", 2)
     config = load(text, settings)
     return Subject(config, resolve_layout(config), None, out or RUNS / f"{config.name}-gantt")
 
