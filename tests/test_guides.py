@@ -92,7 +92,7 @@ class PageShell:
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )
-        wait_until(lambda: rack("status", self.own).returncode == 0, LAUNCH_S)
+        wait_until(lambda: ": running" in rack("status", self.own).stdout, LAUNCH_S)
 
     def run(self, *words: str) -> tuple[int, str]:
         """Run a program; return its exit status and what it printed."""

@@ -186,5 +186,10 @@ def remove_tables(tables: Tables, broken: frozenset[str]) -> Tables:
     remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):
         named = remaining.get(key, {})
-        remaining[key] = {name: t for name, t in named.items() if f"{key}.{name}" not in broken}
+        # A wrong name may contain a dot, as in board."a.b", of which `broken` has the first part.
+        remaining[key] = {
+            name: table
+            for name, table in named.items()
+            if find_table_name(f"{key}.{name}") not in broken
+        }
     return remaining

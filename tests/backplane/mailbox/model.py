@@ -298,7 +298,10 @@ class _Model:
         if state.stops and all(store.publication for store in (*writer.stores, *writer.buffer)):
             yield "stop the writer", self._stopped(writer), {"stops": state.stops - 1}
         if state.kills:
-            dead = Writer(writer.epoch, 0, (), writer.buffer, is_alive=False)
+            # Before the first store of its claim it has taken no epoch: its successor takes that.
+            is_begun = not {"begun", "claim"} <= {store.place for store in writer.stores}
+            epoch = writer.epoch if is_begun else writer.epoch - 1
+            dead = Writer(epoch, 0, (), writer.buffer, is_alive=False)
             yield "kill the writer", dead, {"kills": state.kills - 1}
 
     def _stopped(self, writer: Writer) -> Writer:

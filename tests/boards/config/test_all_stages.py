@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.boards.config.mistakes import find_mistakes
+from tests.boards.config.mistakes import find_mistake, find_mistakes
 
 Write = Callable[[str, str], Path]
 FIGURE = 'executor = "rack.levels.systems.figures:FigureLoop"'
@@ -90,3 +90,18 @@ def test_a_model_that_cannot_be_read_does_not_hide_other_mistakes(write: Write) 
     text += STAGES["fault.kind"].replace("lower", "servo")
     found = places(write("mine.toml", text), "seed")
     assert found == ["--set", "robot", "board.servo.rate_hz", "fault.kind"]
+
+
+def test_a_board_whose_name_contains_a_dot_and_whose_keys_are_wrong_is_left_out() -> None:
+    text = """
+        format = 2
+        name = "dotted"
+        [clock]
+        period_ms = 2.5
+        [board."a.b"]
+        slot = 3
+        every = 1
+        executor = "rack.levels.servo:ServoExecutor"
+        above = [1e300]
+        """
+    assert "board.a.b.above[0] = 1e+300: should be a valid string" in find_mistake(text)
