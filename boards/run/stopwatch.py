@@ -155,12 +155,13 @@ class Stopwatch:
             self._closed_ns,
         )
         self._cycles = block[Block.CYCLES] = self._cycles + 1
+        if not self._cycles % BUS_COUNT_CYCLES:
+            # In lockstep the clock may kill this process as soon as its release is done.
+            self.update_bus_counters()
         block[Block.DONE] = done
         if lockstep_done is not None and (is_missed or done >= block[Block.RELEASED]):
             # This was the last release of a batch, or the clock waits for a late cycle.
             lockstep_done.release()
-        if not self._cycles % BUS_COUNT_CYCLES:
-            self.update_bus_counters()
         self._closed_ns = monotonic_ns()
 
     def _compute_time_ns(self, tick: int) -> int:
