@@ -1,4 +1,4 @@
-"""Standbys: further copies of a task, one of which takes over its mailboxes when it is lost.
+"""Standbys: extra copies of a task. If the active copy is lost, one of them replaces it.
 
 All copies run the same level on the same inputs, released at the same ticks. One of them is active
 and writes the mailboxes. The others hold their messages back and compare them with those of the
@@ -64,7 +64,7 @@ class ReplicatedTask:
     Attributes:
         name: Name of the task.
         copies: Its copies, in their order.
-        since_tick: Tick from which the active copy writes, 0 if no other did before.
+        since_tick: First tick in which the active copy wrote. 0 if it was active from the start.
         reason: Why the active copy has taken over: the name of a `HandOver` in lower case, "none"
             if no other was active before.
         hand_overs: Number of hand-overs.

@@ -186,7 +186,7 @@ def remove_tables(tables: Tables, broken: frozenset[str]) -> Tables:
     remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):
         named = remaining.get(key, {})
-        # A wrong name may contain a dot, as in board."a.b", of which `broken` has the first part.
+        # For a name with a dot, as in board."a.b", `broken` contains only "board.a".
         remaining[key] = {
             name: table
             for name, table in named.items()

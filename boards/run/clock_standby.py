@@ -1,4 +1,4 @@
-"""The standby of the clock: a process that waits until the clock's process has ended, then goes on.
+"""The standby of the clock: a process that runs the clock once the clock's process has ended.
 
 The process that runs the clock holds the kernel's lock on `System.CLOCK_PID` for as long as it
 lives. Whichever process gets the lock runs the clock, so there is never more than one. The new

@@ -112,7 +112,7 @@ class HandOverDirector:
         self._driver.await_state(best, lambda: not words[Block.TAKE_OVER] or best.is_lost)
         return True
 
-    def switch(self, board: str) -> None:
+    def switch_copy(self, board: str) -> None:
         """Request a hand-over for an operator, if a standby has the state of the active copy."""
         for group in self.groups:
             aligned = [task for task in group.tasks if task.block[Block.ALIGNED] > 0]

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 VOTE = "rack.boards.run.vote"
 STATE_PORT = "state"
-"""Output from which a standby is realigned."""
+"""Output with the state from which a standby continues."""
 MAX_AHEAD = 3
-"""Number of messages by which the active copy may be ahead of the cycle that is compared."""
+"""Largest number of messages that the active copy may have written since the compared cycle."""
 
 
 class FieldDifference(NamedTuple):
@@ -190,7 +190,7 @@ class Replica:
         held = self.held_tick
         if held < 0 or held != tick - self._every:
             self._block[Block.ALIGNED] = 0
-            self._realign(tick - self._every)
+            self._realign_level(tick - self._every)
             return None
         if not self._is_lockstep and (reason := self._find_loss(held, is_late)):
             self.take_over(tick, reason)
@@ -200,7 +200,7 @@ class Replica:
             # A level may act differently in the cycle after a late one.
             self._quiet_until = tick + 2 * self._every if self._late >= 0 else -1
             self._late = late
-        difference = self._compare(held)
+        difference = self._compare_messages(held)
         return None if tick <= self._quiet_until else difference
 
     def may_write(self, tick: int) -> bool:
@@ -210,7 +210,7 @@ class Replica:
         self.held_tick = tick
         if self._ballot is not None:
             due = self._list_due(tick)
-            self._ballot.cast(tick, (output.writer.message.raw for output in due))
+            self._ballot.cast_vote(tick, (output.writer.message.raw for output in due))
         return False
 
     def serve_request(self) -> bool:
@@ -291,7 +291,7 @@ class Replica:
         is_worse = is_late or not self._block[Block.ALIGNED]
         return HandOver.NONE if is_worse else HandOver.LATE
 
-    def _compare(self, held: int) -> FieldDifference | None:
+    def _compare_messages(self, held: int) -> FieldDifference | None:
         """Compare the messages held back in a cycle with those of the active copy.
 
         Args:
@@ -323,14 +323,14 @@ class Replica:
             if stray == active:
                 # The state of that copy is of no use.
                 return difference if was_aligned else None
-        self._realign(held)
+        self._realign_level(held)
         return difference if was_aligned and is_complete else None
 
     def _list_due(self, tick: int) -> Iterator[PublishedOutput]:
         """Yield the outputs that the cycle released at `tick` writes."""
         return (output for output in self._published.values() if output.is_due(tick))
 
-    def _realign(self, tick: int) -> None:
+    def _realign_level(self, tick: int) -> None:
         """Let the level continue from the state that the active copy has written at `tick`."""
         state = self._published.get(STATE_PORT)
         if state is not None and state.fetch_message(tick):

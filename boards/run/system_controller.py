@@ -261,7 +261,7 @@ class OperatorCommandIssuer:
             self.changes.change_scheduler(board, message.name, tick)
         entry.stage = RequestStage.GIVEN
         if message.what == Operation.SWITCH and self.hand_overs is not None:
-            self.hand_overs.switch(find_level(entry, self._layout))
+            self.hand_overs.switch_copy(find_level(entry, self._layout))
         if message.what not in PASSING_OPERATIONS:
             self._newest[entry.mailbox] = message.id
         self._alarms.raise_alarm(tick, Alarm.COMMANDED, entry.index, entry.serial)

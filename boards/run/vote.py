@@ -1,4 +1,4 @@
-"""Votes of three copies: the copy whose messages differ from those of the two others has strayed.
+"""Votes of three copies: a copy has strayed if its messages differ from both others.
 
 Each standby stores a checksum of the messages that it holds back in its control block. A standby
 that finds a difference to the active copy compares its own checksum with that of the third copy. If
@@ -40,7 +40,7 @@ class Ballot:
         self._every = every
         self._checksum = 0
 
-    def cast(self, tick: int, messages: Iterable[memoryview]) -> None:
+    def cast_vote(self, tick: int, messages: Iterable[memoryview]) -> None:
         """Store the checksum of the messages held back in the cycle released at `tick`."""
         self._checksum = compute_checksum(messages)
         block = self._blocks[self._number]
@@ -55,7 +55,7 @@ class Ballot:
         Args:
             tick: Release tick of the cycle.
             active: Number of the active copy, whose messages differ from those of this copy.
-            messages: Messages of the active copy, in the order of `cast`.
+            messages: Messages of the active copy, in the order of `cast_vote`.
         """
         at = self._find_words(tick)
         for number, block in enumerate(self._blocks):

@@ -136,9 +136,9 @@ class TrajectoryFollower:
             except Empty:
                 continue
             if not self._has_newer():
-                self._follow(points)
+                self._follow_points(points)
 
-    def _follow(self, points: Sequence[Point]) -> None:
+    def _follow_points(self, points: Sequence[Point]) -> None:
         """Send the points, each when few requests wait, and report how the trajectory ended."""
         motions = self._motions
         requests = [motions.cancel()]

@@ -113,7 +113,7 @@ class MailboxEncoder:
         # Messages of one name may have different fields, as those of bus adapters do.
         type_name = name_type(box.name)
         head = ["std_msgs/Header header", *(f"int64 message_{name}" for name in HEAD)]
-        definition = self._declare(box.name, box.fields, head)
+        definition = self._declare_type(box.name, box.fields, head)
         header, _ = self.store.generate_msgdef(HEADER, ros_version=2)
         self.definitions[type_name] = f"{definition}{SEPARATOR}\nMSG: std_msgs/Header\n{header}"
         topic = RosTopic(f"/mailbox/{convert_name(box.name)}", type_name)
@@ -127,7 +127,9 @@ class MailboxEncoder:
                 data = self.store.serialize_cdr(message, type_name)
                 yield RosMessage(self._encoder.compute_time(tick), topic, data)
 
-    def _declare(self, message: str, fields: Sequence[FieldSpec], head: Sequence[str] = ()) -> str:
+    def _declare_type(
+        self, message: str, fields: Sequence[FieldSpec], head: Sequence[str] = ()
+    ) -> str:
         """Register the type of a message, and the types of its groups.
 
         Args:
@@ -146,7 +148,7 @@ class MailboxEncoder:
             if field.fields:
                 group = f"{message}_{field.name}"
                 base = name_type(group).replace("/msg", "")
-                groups += f"{SEPARATOR}\nMSG: {base}\n{self._declare(group, field.fields)}"
+                groups += f"{SEPARATOR}\nMSG: {base}\n{self._declare_type(group, field.fields)}"
             lines += [
                 f"{base} {field.name.upper()}_{name.upper()}={value}"
                 for name, value in field.values
@@ -163,7 +165,7 @@ class MailboxEncoder:
         """Build messages of a declared type.
 
         Args:
-            message: Name of the mailbox or group, as in `_declare`.
+            message: Name of the mailbox or group, as in `_declare_type`.
             fields: Its fields.
             records: Values of the fields, shape (messages,).
             head: Values of the fields before them, each a list with one value for each message.
