@@ -111,6 +111,7 @@ def write(answer: Any) -> None:
 
 def drain(channel: Any) -> list[Any]:
     """Return what waits in a channel."""
+    # Tests ask again until they have what they expect. This only sets the pace.
     time.sleep(0.01)
     found = []
     while (item := channel.try_recv()) is not None:
