@@ -14,17 +14,14 @@ memory order on which readers rely, see `slots`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Generic, NamedTuple, TypeVar
-from weakref import WeakSet
 
 from rack.backplane.address_map import SLOT_HEAD_SIZE
-from rack.backplane.byte_lock import ByteLock
-from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox.slots import Slots, build_signature, get_epoch, get_pid
+from rack.backplane.mailbox.claim import MailboxClaim
+from rack.backplane.mailbox.slots import Slots, get_pid
 from rack.backplane.message import AnyMessage, Message, copy_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Word
@@ -113,81 +110,18 @@ class Writer:
 
         An intruder is another process that has published since this writer's previous message.
         """
-        # The claim is in the segment, even if the slots publish to another head.
-        self._claimed = segment.get_box(name)
-        self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
-        self.has_claim = False
-        self.is_locked = False
-        """True if this process holds the kernel's lock on the claim.
-
-        A standby that takes over from a stopped process gets it only when that process has ended.
-        """
+        self.claim = MailboxClaim(segment, self.slots)
         if not is_held:
-            self._continue_after(self.claim_mailbox())
-        _WRITERS.add(self)
-
-    def claim_mailbox(self) -> int:
-        """Claim the mailbox in a new epoch.
-
-        Returns:
-            Serial of the newest message of the previous writer.
-
-        Raises:
-            MailboxError: The mailbox has another writer.
-        """
-        if not self.try_lock():
-            pid = self._claimed[Box.WRITER_PID]
-            self._claim.close()
-            raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
-        return self._begin_epoch()
+            self._continue_after(self.claim.take())
 
     def take_over(self) -> None:
-        """Claim the mailbox in a new epoch, even if the process of its writer is alive.
+        """MailboxClaim the mailbox in a new epoch, even if the process of its writer is alive.
 
         Readers reject what that process publishes from now on. Only a standby may call this, while
         it holds the lock on the hand-over: see `rack.backplane.standby`.
         """
-        self.try_lock()
-        self._continue_after(self._begin_epoch())
-
-    @property
-    def holds_claim(self) -> bool:
-        """True if no other process has claimed the mailbox since this one did."""
-        return self.has_claim and self._claimed[Box.CLAIMANT] == self.slots.signature
-
-    def try_lock(self) -> bool:
-        """Take the kernel's lock on the claim, unless another process holds it."""
-        self.is_locked = self.is_locked or self._claim.take()
-        return self.is_locked
-
-    def release_claim(self) -> None:
-        """Stop writing, because a standby has taken over the mailbox."""
-        self.has_claim = self.is_locked = False
-        self._claim.release()
-
-    def _begin_epoch(self) -> int:
-        """Enter this process in the head of the mailbox as its writer.
-
-        Returns:
-            Serial of the newest message of the previous writer.
-        """
-        box = self._claimed
-        epoch = get_epoch(box[Box.EPOCH] + 1)
-        # A previous writer that was stopped may store this word again at any time, so load it once.
-        head = box[Box.HEAD]
-        box[Box.BEGUN + epoch % Box.EPOCHS] = head
-        # A reader that finds the new claim must find the word that belongs to it.
-        self.slots.fence()
-        box[Box.WRITER_PID] = os.getpid()
-        box[Box.EPOCH] = epoch
-        # Epoch and process are stored in one word, so that no reader sees half a claim.
-        box[Box.CLAIMANT] = signature = build_signature(epoch, os.getpid())
-        # The word of the checksum depends on the signature: see `Slots.chain`.
-        chain = self.slots.chain
-        self.slots.signature = signature
-        self.slots.chain = chain
-        self.has_claim = True
-        return head
+        self.claim.try_lock()
+        self._continue_after(self.claim.begin_epoch())
 
     def _continue_after(self, head: int) -> None:
         """Continue after the newest message of the previous writer, which has this serial."""
@@ -274,20 +208,7 @@ class Writer:
 
     def close(self) -> None:
         """Release the claim on the mailbox."""
-        _WRITERS.discard(self)
-        self._claim.close()
-
-
-_WRITERS: WeakSet[Writer] = WeakSet()
-"""Writers of this process that have claimed their mailboxes."""
-
-
-def reclaim_mailboxes() -> None:
-    """Claim all mailboxes of this process again, after it was switched to another segment."""
-    for writer in _WRITERS:
-        if writer.has_claim:
-            writer.is_locked = False
-            writer.claim_mailbox()
+        self.claim.close()
 
 
 @dataclass(slots=True)

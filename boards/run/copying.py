@@ -28,7 +28,7 @@ from typing import Any
 
 from rack.backplane import copies
 from rack.backplane.json_text import encode_json
-from rack.backplane.mailbox.mailbox import reclaim_mailboxes
+from rack.backplane.mailbox.claim import reclaim_mailboxes
 from rack.backplane.process import COPY_PREFIX, die_with_parent, name_process
 from rack.backplane.segment import Segment
 from rack.boards.errors import SnapshotError

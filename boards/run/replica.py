@@ -183,10 +183,10 @@ class Replica:
         if self.is_active:
             self._keep_claims(tick)
             return None
-        if self._writers and self._writers[0].has_claim:
+        if self._writers and self._writers[0].claim.is_taken:
             # Another copy has taken over while this one was late or stopped.
             for writer in self._writers:
-                writer.release_claim()
+                writer.claim.release()
         held = self.held_tick
         if held < 0 or held != tick - self._every:
             self._block[Block.ALIGNED] = 0
@@ -205,7 +205,7 @@ class Replica:
 
     def may_write(self, tick: int) -> bool:
         """Return True if this copy is active. Otherwise hold back the messages of the cycle."""
-        if self.is_active and all(writer.holds_claim for writer in self._writers):
+        if self.is_active and all(writer.claim.is_valid for writer in self._writers):
             return True
         self.held_tick = tick
         if self._ballot is not None:
@@ -264,9 +264,9 @@ class Replica:
 
     def _keep_claims(self, tick: int) -> None:
         """Claim the mailboxes if this is a new process or a standby has died while taking over."""
-        if all(writer.holds_claim for writer in self._writers):
+        if all(writer.claim.is_valid for writer in self._writers):
             for writer in self._writers:
-                writer.is_locked or writer.try_lock()
+                writer.claim.try_lock()
         elif not self._group[Block.TAKE_OVER]:
             # Otherwise the clock has asked another copy to take over from an earlier process.
             self.take_over(tick, HandOver.LOST)

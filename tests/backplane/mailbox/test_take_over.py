@@ -42,13 +42,13 @@ def test_a_standby_continues_after_the_newest_message(make_bus: MakeBus, has_die
     if has_died:
         writer.close()
     standby.take_over()
-    assert standby.is_locked == has_died
-    assert (standby.holds_claim, writer.holds_claim) == (True, False)
+    assert standby.claim.is_locked == has_died
+    assert (standby.claim.is_valid, writer.claim.is_valid) == (True, False)
     write(standby, 1, 2)
     assert read(reader, 2) == (2, NEW)
     if not has_died:
-        writer.release_claim()
-        assert standby.try_lock()
+        writer.claim.release()
+        assert standby.claim.try_lock()
 
 
 def test_two_runs_with_and_without_a_hand_over_have_equal_chains(make_bus: MakeBus) -> None:
@@ -139,7 +139,7 @@ def mine(writer: Writer, bomb: Bomb) -> None:
     """Let every store of a writer to shared memory count."""
     slots: Any = writer.slots
     slots.box = MinedBox(slots.box, bomb)
-    writer._claimed = MinedBox(writer._claimed, bomb)  # type: ignore[assignment]
+    writer.claim._box = MinedBox(writer.claim._box, bomb)  # type: ignore[assignment]
     slots.places = [MinedSlot(place, bomb) for place in slots.places]
     slots.heads = [MinedBox(words, bomb) for words in slots.heads]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from rack.backplane.mailbox.claim import MailboxClaim
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.slots import SIGNED_FROM, Slots
 from rack.backplane.segment import Segment
@@ -188,8 +189,8 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
         "pass",
     ),
     "claim after publication": (
-        Writer,
-        "_begin_epoch",
+        MailboxClaim,
+        "begin_epoch",
         "box[Box.CLAIMANT] = signature",
         "signature",
     ),
