@@ -123,9 +123,7 @@ class ReplicatedLoop(VirtualControlLoop):
         self._lock = ByteLock(segment.fd, segment.map.blocks[board] + 8 * Block.ACTIVE)
         self._writers = tuple(self.outputs.writers.values())
         self._outputs = [ReplicatedOutput(segment, port) for port in self.outputs.ports]
-        self._held_tick: int | None = (
-            None  # release of the last cycle whose messages were held back
-        )
+        self._held_tick: int | None = None  # last cycle whose messages were held back
         self._late = self._quiet_until = -1
         # Copies that begin with the run are equal from their first cycle on.
         self._is_first = self.words[System.STATE] == Run.STARTING
@@ -229,7 +227,7 @@ class ReplicatedLoop(VirtualControlLoop):
         was_aligned = block[Block.ALIGNED] or self._is_first
         self._is_first = False
         due = self._list_due(held)
-        if all([output.fetch_message(held) for output in due]):
+        if all(output.fetch_message(held) for output in due):
             differing = next((output for output in due if output.published != output.held), None)
             if differing is None:
                 block[Block.ALIGNED] = block[Block.ALIGNED] or held + 1
