@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.address_map import CLOCK
+from rack.backplane.address_map import CLOCK, CLOCK_STANDBY
 from rack.backplane.checked import select_item, to_enum, to_integer
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.message import escape_text
@@ -318,7 +318,7 @@ class AlarmReader:
         """
         match about:
             case "task":
-                return self._name_task(number, CLOCK)
+                return self._name_task(number, CLOCK if number == -1 else CLOCK_STANDBY)
             case "mailbox":
                 return select_item(self._layout.mailboxes, number, "mailbox").name
             case "joint":

@@ -46,13 +46,12 @@ class HandOverDirector:
         self._driver = driver
         self._is_lockstep = bool(segment.words[System.LOCKSTEP])
         tasks = {task.spec.name: task for task in driver.tasks}
-        boards = dict.fromkeys(t.board for t in segment.layout.tasks if t.role == "standby")
         self.groups = [
             Copies(
                 segment.get_block(board),
                 [tasks[copy.name] for copy in segment.layout.list_copies(board)],
             )
-            for board in boards
+            for board in segment.layout.replicated
         ]
 
     def check_active_copies(self) -> None:

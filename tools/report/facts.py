@@ -82,6 +82,16 @@ def list_facts(report: RunReport) -> Iterator[Row]:
         span = f"{longest['level']} for {longest['lasted_s']:g} s from {longest['since_s']:g} s"
         yield "holds", [f"{len(holds)}, longest {span}: {longest['why']}"]
     yield "restarts", [f"{task} {count}" for task, count in (report.restarts or {}).items()]
+    yield (
+        "standbys",
+        [
+            f"{copy['active']} active since {copy['since_s']:g} s (tick {copy['since_tick']}): "
+            f"{copy['why']}, hand-overs: {copy['hand_overs']}"
+            if copy["hand_overs"]
+            else f"{copy['active']} active throughout"
+            for copy in report.standbys or ()
+        ],
+    )
     for end in report.others:
         yield "rack", [f"{end['rack']}: {end['cause']} after {end['ticks']} ticks, {end['folder']}"]
     if origin := report.continues:
