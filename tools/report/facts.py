@@ -70,6 +70,7 @@ def list_facts(report: RunReport) -> Iterator[Row]:
     yield from _list_outcome(report)
     brakings = [Braking(**braking) for braking in outcome["brakings"]]
     yield "brakes", [format_brakings(brakings).removeprefix("brakes ")] if brakings else []
+    yield "standbys", [_format_active_copy(**copy) for copy in report.standbys or ()]
     if report.faults is not None:
         yield "faults", _list_fault_clauses(report.faults, report.unexplained)
     holds = [
@@ -82,16 +83,6 @@ def list_facts(report: RunReport) -> Iterator[Row]:
         span = f"{longest['level']} for {longest['lasted_s']:g} s from {longest['since_s']:g} s"
         yield "holds", [f"{len(holds)}, longest {span}: {longest['why']}"]
     yield "restarts", [f"{task} {count}" for task, count in (report.restarts or {}).items()]
-    yield (
-        "standbys",
-        [
-            f"{copy['active']} active since {copy['since_s']:g} s (tick {copy['since_tick']}): "
-            f"{copy['why']}, hand-overs: {copy['hand_overs']}"
-            if copy["hand_overs"]
-            else f"{copy['active']} active throughout"
-            for copy in report.standbys or ()
-        ],
-    )
     for end in report.others:
         yield "rack", [f"{end['rack']}: {end['cause']} after {end['ticks']} ticks, {end['folder']}"]
     if origin := report.continues:
@@ -116,6 +107,16 @@ def _list_outcome(report: RunReport) -> Iterator[Row]:
         if "touches" in found and not any(found[key] for key in COUNT_TEXTS):
             clauses.append("no contact, no limit reached")
         yield name, clauses
+
+
+def _format_active_copy(
+    active: str, since_tick: int, since_s: float, why: str, hand_overs: int, **_: object
+) -> str:
+    """Format an entry of `RunReport.standbys` as a clause."""
+    if not hand_overs:
+        return f"{active} active throughout"
+    times = f", after {hand_overs} hand-overs" if hand_overs > 1 else ""
+    return f"{active} active since {since_s:g} s (tick {since_tick}){times}: {why}"
 
 
 def _list_fault_clauses(

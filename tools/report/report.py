@@ -135,9 +135,10 @@ def build_report(recording: Recording) -> Document:
 
 def summarize_standbys(recording: Recording) -> list[Document]:
     """Return the active copy of each task with standbys at the end, since when, and why."""
-    since = {"since_tick": 0, "since_s": 0.0, "why": "", "hand_overs": 0}
+    since: Document = {"since_tick": 0, "since_s": 0.0, "why": "", "hand_overs": 0}
     found = {task: {"task": task, "active": task, **since} for task in recording.layout.replicated}
-    for event in recording.events:
+    # A run that continues another one also has hand-overs of that one.
+    for event in (*recording.end_counts.get("earlier", ()), *recording.events):
         if event.get("code") == "taken_over":
             task = event["subject"].partition(".")[0]
             found[task] = {

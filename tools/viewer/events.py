@@ -85,12 +85,10 @@ class EventWriter:
         self._stream.log_line(when, "events", text, LOG_LEVELS.get(event.kind, "INFO"))
         if event.kind not in KINDS_WITHOUT_LANE:
             self._write_lane(when, board, event)
-        if event.code == "taken_over":
-            self._write_active(when, event.subject)
-        elif event.kind == "start":
-            for standby in self._names:
-                if standby.endswith(".standby"):
-                    self._write_active(when, standby.partition(".")[0])
+        if event.code in ("active", "taken_over"):
+            task = event.subject.partition(".")[0]
+            lane = (EVENTS, self._names.get(task, task), "active")
+            write_span(self._stream, when, lane, event.subject)
         if self._marks is not None:
             self._marks.mark_event(when, event)
         lost = board if event.kind == "died" else event.subject if event.code == "hang" else ""
@@ -100,11 +98,6 @@ class EventWriter:
             self._mark_lost(when, lost)
         elif event.code == "rejoined":
             self._lost.discard(board)
-
-    def _write_active(self, when: Moment, copy: str) -> None:
-        """Write the active copy of a task with standbys to a lane below that of its events."""
-        task = copy.partition(".")[0]
-        write_span(self._stream, when, (EVENTS, self._names.get(task, task), "active"), copy)
 
     def _write_lane(self, when: Moment, board: str, event: Event) -> None:
         """Write an event as the new state of its board's lane."""
