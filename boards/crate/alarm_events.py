@@ -244,7 +244,7 @@ class AlarmReader:
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
         elif about == "finding":
-            level = self._find_level(owner)
+            level = owner.partition(".standby")[0]
             declared = self._levels[level].findings if level in self._levels else ()
             finding = select_item(declared, number, "finding")
             code = finding.name
@@ -326,7 +326,7 @@ class AlarmReader:
             case "geom":
                 return self._geom(number)
             case "name":
-                level = self._find_level(owner)
+                level = owner.partition(".standby")[0]
                 names = self._levels[level].names if level in self._levels else ()
                 return select_item(names, number, "name")
             case "brakes" if number > 0:
@@ -350,11 +350,6 @@ class AlarmReader:
         before = self._live.get((board, key), param and param.launched)
         self._live[board, key] = value
         return f", before {before}"
-
-    def _find_level(self, owner: str) -> str:
-        """Return the name of the level that the owner of an alarm ring runs."""
-        standbys = {task.name: task.board for task in self._layout.tasks if task.role == "standby"}
-        return standbys.get(owner, owner)
 
     def _name_task(self, number: int, other: str) -> str:
         """Return the name of a task by its number, or `other` for a negative number."""

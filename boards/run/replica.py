@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from xxhash import xxh3_64
+from xxhash import xxh3_64_intdigest
 
 from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
@@ -39,7 +39,6 @@ STATE_SUFFIX = ".state"
 """End of the name of the mailbox with the state from which a standby continues."""
 MAX_AHEAD = 3
 """Largest number of messages that the active copy may have written since the compared cycle."""
-_SIGN = 1 << 63
 
 
 class ReplicatedOutputs(OutputPorts):
@@ -132,7 +131,7 @@ class ReplicatedLoop(VirtualControlLoop):
         self.next_cycle.serve_request = self.serve_request
         self.block[Block.ALIGNED] = 0
         if self._is_first and self._number == 0:
-            self._claim_mailboxes()
+            self._take_over(0, HandOver.NONE)
 
     @property
     def is_active(self) -> bool:
@@ -304,7 +303,8 @@ class ReplicatedLoop(VirtualControlLoop):
             return False
         try:
             if group[Block.ACTIVE] == active:
-                self._claim_mailboxes()
+                for writer in self._writers:
+                    writer.take_over()
                 if active != self._number:
                     group[Block.ACTIVE_SINCE] = tick
                     group[Block.HAND_OVER] = reason
@@ -318,11 +318,6 @@ class ReplicatedLoop(VirtualControlLoop):
             self._lock.release()
         return self.is_active
 
-    def _claim_mailboxes(self) -> None:
-        """Claim all mailboxes of the task, in new epochs."""
-        for writer in self._writers:
-            writer.take_over()
-
     def _report_findings(self, tick: int) -> None:
         """Report findings if this copy is active. Otherwise drop them."""
         if not self.is_active:
@@ -332,8 +327,5 @@ class ReplicatedLoop(VirtualControlLoop):
 
 
 def compute_vote(tick: int, messages: Iterable[memoryview]) -> int:
-    """Return a checksum of the messages of a cycle as a signed word. It depends on the tick too."""
-    checksum = xxh3_64(seed=tick)
-    for message in messages:
-        checksum.update(message)
-    return checksum.intdigest() - _SIGN
+    """Return a checksum of the messages of a cycle, 63 bits. It depends on the tick too."""
+    return xxh3_64_intdigest(b"".join(messages), tick) >> 1

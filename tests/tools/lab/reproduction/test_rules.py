@@ -218,10 +218,10 @@ def moved(value: float, error_mrad: float, jerk: float, brakings: int) -> Motion
 
 
 STILL = moved(0.0, 0.3, 60.0, 0)
-REPLACED = LossRun("7b", 1.6, 0, 0, 0, 1)
+REPLACED = LossRun("7b", 0, 0, 0, 1)
 REPLICATED = ReplicationRun(
     undisturbed=replace(REPLACED, hand_overs=0),
-    alone=LossRun("c7", 1.6, 200, 1, 200, 0),
+    alone=LossRun("c7", 200, 1, 200, 0),
     replicated=REPLACED,
 )
 SMOOTH = SmoothnessRun(
@@ -323,11 +323,6 @@ RULINGS = [
         )
     ),
     ("replication", [replace(REPLICATED, alone=REPLACED)], Ruling.UNTESTABLE),
-    (
-        "replication",
-        [replace(REPLICATED, undisturbed=replace(REPLACED, moving_rad_s=0.0))],
-        Ruling.UNTESTABLE,
-    ),
 ]
 
 

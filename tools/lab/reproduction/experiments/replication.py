@@ -5,9 +5,7 @@ All runs are in lockstep, so their messages differ by nothing but the loss and t
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-
-import numpy as np
+from dataclasses import dataclass
 
 from rack.tools.console.tables import format_table
 from rack.tools.lab.reproduction.experiments.experiment import ChartedRecord, Experiment, Workshop
@@ -28,7 +26,6 @@ class LossRun:
 
     Attributes:
         digest: Digest of the run.
-        moving_rad_s: Speed of the fastest joint at the last set point before `LOST_AT`.
         ticks_without_torque: Ticks without a status of the servo level, or with engaged brakes.
         brakings: Number of times that the brakes have engaged.
         messages_missing: Statuses of the servo level that were not written.
@@ -36,7 +33,6 @@ class LossRun:
     """
 
     digest: str
-    moving_rad_s: float
     ticks_without_torque: int
     brakings: int
     messages_missing: int
@@ -59,10 +55,8 @@ def _measure_replication(workshop: Workshop) -> ReplicationRun:
         "loss": measure_loss(workshop, f"fault=[{KILL}]"),
         "loss, standby": measure_loss(workshop, f"fault=[{KILL}]", STANDBY),
     }
-    rows = [
-        [name, *map(str, [*asdict(run).values()][2:]), run.digest[:8]] for name, run in runs.items()
-    ]
-    head = ["run", "ticks without torque", "brakings", "messages missing", "hand-overs", "digest"]
+    rows = [[name, *map(str, vars(run).values())] for name, run in runs.items()]
+    head = ["run", "digest", "ticks without torque", "brakings", "messages missing", "hand-overs"]
     return ReplicationRun(*runs.values(), chart="\n".join(format_table(head, rows)))
 
 
@@ -70,19 +64,15 @@ def measure_loss(workshop: Workshop, *settings: str) -> LossRun:
     """Run the rack with additional settings."""
     config = workshop.load_config(NAME, (LOCKSTEP, *settings))
     result, run = workshop.run("replication", config, SECONDS)
-    ticks = run.read_signal("servo.status", "tick")
-    before = ticks < LOST_AT
-    braked = np.ones(result.outcome.ticks, dtype=bool)
-    braked[ticks] = run.read_signal("servo.status", "braked")
-    after = braked[LOST_AT - 1 :]
+    is_late = run.read_signal("servo.status", "tick") >= LOST_AT
+    braked = run.read_signal("servo.status", "braked")[is_late]
+    missing = result.outcome.ticks - LOST_AT - len(braked)
     codes = [event.get("code") for event in run.events if event.get("tick", -1) >= LOST_AT]
-    speeds = np.abs(run.read_signal("servo.status", "target_velocity")[before][-1:])
     return LossRun(
         result.outcome.digest,
-        float(speeds.max(initial=0.0)),
-        int(after.sum()),
+        missing + int(braked.sum()),
         codes.count("brakes_closed"),
-        len(after) - 1 - int(np.count_nonzero(~before)),
+        missing,
         codes.count("taken_over"),
     )
 
