@@ -281,7 +281,6 @@ class Layout:
         """
         hosts = {host.name for host in self.hosts}
         tasks = {task.name for task in self.tasks}
-        replicated = {task.board for task in self.tasks if task.role == "standby"}
         return tuple(
             mailbox
             for mailbox in self.mailboxes
@@ -289,9 +288,14 @@ class Layout:
             and (
                 mailbox.readers
                 or mailbox.writer in tasks
-                or mailbox.name.partition(".")[0] not in replicated
+                or mailbox.name.partition(".")[0] not in self.replicated
             )
         )
+
+    @property
+    def replicated(self) -> tuple[str, ...]:
+        """Names of the tasks that have standbys."""
+        return tuple(dict.fromkeys(t.board for t in self.tasks if t.role == "standby"))
 
     def list_copies(self, task: str) -> tuple[TaskSpec, ...]:
         """Return a task, followed by its standbys in their order."""

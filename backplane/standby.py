@@ -16,7 +16,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rack.backplane.checked import to_enum
 from rack.backplane.segment import Segment
@@ -65,6 +65,7 @@ class ReplicatedTask:
         name: Name of the task.
         copies: Its copies, in their order.
         since_tick: First tick in which the active copy wrote. 0 if it was active from the start.
+        since_s: Simulated time of that tick.
         reason: Why the active copy has taken over: the name of a `HandOver` in lower case, "none"
             if no other was active before.
         hand_overs: Number of hand-overs.
@@ -74,6 +75,7 @@ class ReplicatedTask:
     name: str
     copies: tuple[Copy, ...]
     since_tick: int
+    since_s: float
     reason: str
     hand_overs: int
     line: str
@@ -86,42 +88,30 @@ class ReplicatedTask:
 
 def list_standbys(segment: Segment) -> tuple[ReplicatedTask, ...]:
     """Return all tasks that have standbys, with the state of each copy."""
-    layout = segment.layout
-    boards = dict.fromkeys(task.board for task in layout.tasks if task.role == "standby")
-    return tuple(_read_task(segment, board) for board in boards)
+    return tuple(_read_task(segment, board) for board in segment.layout.replicated)
 
 
 def _read_task(segment: Segment, name: str) -> ReplicatedTask:
     """Return the state of one task with standbys."""
     words = segment.get_block(name)
     copies = []
+    others = []
     for number, spec in enumerate(segment.layout.list_copies(name)):
         block = segment.get_block(spec.name)
-        is_active = number == words[Block.ACTIVE]
+        is_active, is_lost = number == words[Block.ACTIVE], bool(block[Block.LOST])
         aligned = block[Block.ALIGNED] - 1
-        is_aligned = aligned >= 0 and not is_active and not block[Block.LOST]
-        copies.append(
-            Copy(
-                spec.name,
-                spec.slot,
-                spec.core,
-                block[Block.PID],
-                is_active,
-                bool(block[Block.LOST]),
-                aligned if is_aligned else None,
-            )
-        )
+        aligned_since = None if aligned < 0 or is_active or is_lost else aligned
+        place = spec.name, spec.slot, spec.core, block[Block.PID]
+        copies.append(Copy(*place, is_active, is_lost, aligned_since))
+        if not is_active:
+            ready = "not ready" if aligned_since is None else f"ready since tick {aligned_since}"
+            others.append(f"; {spec.name} {'lost' if is_lost else ready}")
     reason = to_enum(HandOver, words[Block.HAND_OVER])
-    hand_overs = words[Block.HAND_OVERS]
     since_tick = words[Block.ACTIVE_SINCE]
-    parts = [f"{copy.name} {_describe_copy(copy)}" for copy in copies]
-    since = f" since tick {since_tick}: {HAND_OVER_REASONS[reason]}" if hand_overs else ""
-    line = f"'{name}': {', '.join(parts)}{since}"
-    return ReplicatedTask(name, tuple(copies), since_tick, reason.name.lower(), hand_overs, line)
-
-
-def _describe_copy(copy: Copy) -> str:
-    """Return the state of a copy."""
-    if copy.is_active:
-        return "active"
-    return "lost" if copy.is_lost else "not ready" if copy.aligned_since is None else "ready"
+    since_s = since_tick * segment.layout.clock_ns * 1e-9
+    why = f" since tick {since_tick} ({since_s:g} s): {HAND_OVER_REASONS[reason]}"
+    task = ReplicatedTask(
+        name, tuple(copies), since_tick, since_s, reason.name.lower(), words[Block.HAND_OVERS], ""
+    )
+    head = f"'{name}': {task.active.name} active{why * bool(reason)}"
+    return replace(task, line="".join([head, *others]))

@@ -206,9 +206,9 @@ class Block:
     # Of each copy: 1 + tick since which its outputs equal those of the active copy, 0 while they
     # differ. Written by the copy.
     ALIGNED = 40
-    # Of each copy in a vote: 1 + tick of a cycle and checksum of its messages, then the same of the
-    # next or the previous cycle. Written by the copy.
-    BALLOT = 41
+    # This word and the next one: vote of a copy in a cycle and in the one before or after it, see
+    # `rack.boards.run.replica`. Written by the copy.
+    VOTE = 41
     # Of a task with standbys: 1 + number of the copy that has strayed, 0 for none. Written by the
     # copy that has found it, and cleared by the clock.
     STRAYED = 45

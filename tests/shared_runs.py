@@ -20,6 +20,7 @@ SMALL_S = 4.0
 SLOW_RATES = ("board.upper.rate_hz=10", "board.lower.rate_hz=80")
 """Cycles of 40 and 5 ticks."""
 SLOW_S = 5.0
+LOWER_LOST_AT, CLOCK_LOST_AT = 80, 200
 NASREM_S = 6.5
 """The first path is planned, and part of it driven."""
 
@@ -45,6 +46,17 @@ def faulty_run(factory: pytest.TempPathFactory) -> Path:
     hang = '{ kind = "hang", board = "upper", tick = 80 }'
     idle = '{ kind = "hang", board = "lower", when = "upper.status.state == error", for = "20ms" }'
     return _copy(factory, "faulty", 3.0, [f"fault=[{hang}, {idle}]"])
+
+
+def standby_run(factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of a run in lockstep of the small rack with standbys of both boards and of the
+    clock, in which the lower board is killed at `LOWER_LOST_AT` and the clock later."""
+    lower = f'{{ kind = "kill", board = "lower", tick = {LOWER_LOST_AT} }}'
+    clock = f'{{ kind = "kill", board = "clock", tick = {CLOCK_LOST_AT} }}'
+    places = {"board.lower": 9, "board.upper": 10, "clock": 11}
+    standbys = [f"{name}.standby={{slot={slot},core=0}}" for name, slot in places.items()]
+    soon = "supervision.lockstep_restart_s=0.05"
+    return _copy(factory, "standby", 3.0, [*standbys, f"fault=[{lower}, {clock}]", soon])
 
 
 def _copy(

@@ -164,10 +164,7 @@ def open_writer(segment: Segment, name: str) -> Writer:
 
 def open_standby_writer(segment: Segment, name: str) -> Writer:
     """Open a mailbox under protocol time-slice or double-buffer, without claiming it."""
-    kind = Writer
-    if segment.layout.find_mailbox(name).protocol == "double-buffer":
-        kind = DoubleBufferWriter
-    return kind(segment, name, is_held=True)
+    return WRITERS[segment.layout.find_mailbox(name).protocol](segment, name, is_held=True)
 
 
 def open_reader(

@@ -60,7 +60,8 @@ class Alarm(IntEnum):
     # [mailbox; -, the text names the field] a standby computes another message than the active copy
     DIFFERS = 9
     STRAYED = 15  # [task; -]  this copy of a task differs from two others, and is taken out
-    TAKEN_OVER = 14  # [task; HandOver]  this copy of a task writes its mailboxes from this tick
+    # [task, -1: the clock, -2: its standby; HandOver] this copy is active from this tick
+    TAKEN_OVER = 14
     OPERATOR_GONE = 8  # [entry of the operator table; serial]  a command under a lease: hold
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release

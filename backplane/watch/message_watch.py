@@ -46,9 +46,10 @@ class MessageWatch:
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots
-        copies = segment.layout.list_copies(reader.spec.writer)
+        writer = reader.spec.writer
+        copies = segment.layout.list_copies(writer)
         self._records = [CycleRecord(segment, copy.name) for copy in copies]
-        self._blocks = [segment.get_block(copy.name) for copy in copies]
+        self._blocks = segment.get_copy_blocks(writer)
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_tick_based
         # A message that is visible at once carries the tick at which it was written.

@@ -339,8 +339,8 @@ class Examination:
             scheduling=(
                 build_scheduling(self._config, spec.board, spec.every) if is_executor else None
             ),
-            compares=is_executor and board.compare,
-            votes=is_executor and board.vote,
+            compares=board.compare,
+            votes=board.vote,
             budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}

@@ -44,20 +44,15 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _to_tuple(value: Any) -> Any:
-    """Convert a single name or a list of names to a tuple. Return other values unchanged."""
-    if isinstance(value, str):
+    """Convert one name or table, or a list of them, to a tuple. Return other values unchanged."""
+    if isinstance(value, str | Mapping):
         return (value,)
     return tuple(value) if isinstance(value, list) else value
 
 
-def _to_list(value: Any) -> Any:
-    """Convert a single table or a list of tables to a tuple. Return other values unchanged."""
-    return (value,) if isinstance(value, Mapping) else _to_tuple(value)
-
-
 RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
-Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(_to_list)]
+Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(_to_tuple)]
 Neighbours = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
 Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_to_tuple)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
@@ -526,6 +521,15 @@ class RackConfig(Table):
                     core,
                     board.planner_priority,
                 )
+
+    def list_standby_tables(self) -> Iterator[tuple[str, StandbyConfig]]:
+        """Yield the table of each standby with its place, as in "board.servo.standby[1]"."""
+        if self.clock.standby is not None:
+            yield "clock.standby", self.clock.standby
+        for name, board in self.board.items():
+            for number, standby in enumerate(board.standby):
+                index = f"[{number}]" if len(board.standby) > 1 else ""
+                yield f"board.{name}.standby{index}", standby
 
     def list_standbys(self) -> Iterator[TaskEntry]:
         """Yield the standbys of all boards, as in "servo.standby" and "servo.standby2"."""

@@ -17,7 +17,7 @@ from rack.boards.config.schema import (
 )
 from rack.boards.faults.config import FaultConfig
 from rack.boards.timing.interrupts import InboxTiming
-from rack.boards.timing.level import BoardTiming
+from rack.boards.timing.level import BoardTiming, StandbyPlace
 from rack.boards.timing.rack import CyclicSchedule, RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 
@@ -139,6 +139,11 @@ def _build_board_timing(
         phase=board.phase,
         scheduler=find_scheduler(config, name),
         is_urgent=board.critical,
+        standbys=tuple(
+            StandbyPlace(place.name, place.core, place.priority)
+            for place in config.list_standbys()
+            if place.board == name
+        ),
         reads=_find_read_ticks(layout, name),
     )
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.address_map import CLOCK
+from rack.backplane.address_map import CLOCK, CLOCK_STANDBY
 from rack.backplane.checked import select_item, to_enum, to_integer
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.message import escape_text
@@ -244,7 +244,7 @@ class AlarmReader:
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
         elif about == "finding":
-            level = self._find_level(owner)
+            level = owner.partition(".standby")[0]
             declared = self._levels[level].findings if level in self._levels else ()
             finding = select_item(declared, number, "finding")
             code = finding.name
@@ -318,7 +318,7 @@ class AlarmReader:
         """
         match about:
             case "task":
-                return self._name_task(number, CLOCK)
+                return self._name_task(number, CLOCK if number == -1 else CLOCK_STANDBY)
             case "mailbox":
                 return select_item(self._layout.mailboxes, number, "mailbox").name
             case "joint":
@@ -326,7 +326,7 @@ class AlarmReader:
             case "geom":
                 return self._geom(number)
             case "name":
-                level = self._find_level(owner)
+                level = owner.partition(".standby")[0]
                 names = self._levels[level].names if level in self._levels else ()
                 return select_item(names, number, "name")
             case "brakes" if number > 0:
@@ -350,11 +350,6 @@ class AlarmReader:
         before = self._live.get((board, key), param and param.launched)
         self._live[board, key] = value
         return f", before {before}"
-
-    def _find_level(self, owner: str) -> str:
-        """Return the name of the level that the owner of an alarm ring runs."""
-        standbys = {task.name: task.board for task in self._layout.tasks if task.role == "standby"}
-        return standbys.get(owner, owner)
 
     def _name_task(self, number: int, other: str) -> str:
         """Return the name of a task by its number, or `other` for a negative number."""

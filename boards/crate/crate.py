@@ -22,6 +22,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from socket import socket
 
+from rack.backplane.address_map import CLOCK_STANDBY
 from rack.backplane.copies import restore_memory
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import record_used_files
@@ -199,7 +200,9 @@ class Crate:
         If the snapshot contains a copy that can continue with this wiring, it continues. Otherwise
         a new process is forked.
         """
-        self._wirings[name] = wiring
+        if name != CLOCK_STANDBY:
+            # A standby of the clock has no state, so snapshots do not contain it.
+            self._wirings[name] = wiring
         copy = self._copies_to_continue.pop(name, None)
         if copy is not None and copy.can_continue_as(wiring):
             try:

@@ -14,6 +14,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry
 from rack.backplane.segment import Segment
+from rack.backplane.standby import list_standbys
 from rack.backplane.words import Block, System
 from rack.boards.config.commands import build_request, parse_command
 from rack.boards.config.loader import load
@@ -198,8 +199,6 @@ class Rack:
         """Return why no snapshots can be taken. Empty if they can."""
         if not self.config.is_lockstep:
             return "they are taken in lockstep; add --lockstep"
-        if self.config.clock.standby is not None:
-            return "its clock has a standby"
         # In a replay there is no outside state: the wiring contains the recorded messages.
         is_replay = any(task.entries is not None for task in plan.tasks)
         return "" if is_replay else self.config.outside_state
@@ -252,6 +251,9 @@ class Rack:
             for board, lost in self._continues.losses:
                 if lost < tick:
                     supervisor.policy.admit_restart(board, lost)
+        for task in list_standbys(self.segment):
+            name = task.active.name
+            self._journal.add_event("start", name, f"'{name}' is active", "active", subject=name)
         supervisor.recovery.start(clock, plan)
         self._journal.add_event("start", CLOCK, self.config.clock.mode)
 

@@ -121,11 +121,6 @@ class TaskFaults:
         self._spec = spec
         self._tasks = segment.layout.tasks
         self._index = segment.layout.processes.index(spec)
-        # A fault of the arm strikes what all copies of a task simulate.
-        self._copies = {self._index}
-        if spec.role in ("executor", "standby"):
-            copies = segment.layout.list_copies(spec.board)
-            self._copies = {segment.layout.processes.index(copy) for copy in copies}
         self._apply = apply
         self._level = level
         self._clock = SystemClock(segment)
@@ -150,7 +145,9 @@ class TaskFaults:
         begun = [
             (kind, entry)
             for kind, entry in ((find_kind(entry), entry) for entry in entries)
-            if entry.task == self._index or (kind.where == "arm" and entry.task in self._copies)
+            # A fault of the arm strikes what all copies of a task simulate.
+            if entry.task == self._index
+            or (kind.where == "arm" and self._tasks[entry.task].board == self._spec.board)
         ]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [

@@ -202,14 +202,11 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     # Memory is not touched in advance, because every board waits for the start of the clock. The
     # clock's lead over its grid points leaves enough time for a page fault.
     hold_memory(wiring.lockstep)
-    lock = None
     if wiring.copy is not None:
-        # Import it only in racks whose clock has a standby.
-        lock = import_module(CLOCK_LOCK).await_clock_lock(segment, is_standby=wiring.copy > 0)
+        # Import it only in racks whose clock has a standby. The lock ends with this process.
+        import_module(CLOCK_LOCK).await_clock_lock(segment, is_standby=wiring.copy > 0)
         if segment.words[System.STATE] == Run.STOPPED:
             return 0
     with keep_cores_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)
-    if lock is not None:
-        lock.close()
     return 0

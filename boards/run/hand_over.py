@@ -8,7 +8,7 @@ by itself if it finds the active copy late or stopped: see `rack.boards.run.repl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from rack.backplane.clock.driver import ClockDriver
 from rack.backplane.clock.released_task import ReleasedTask
@@ -17,16 +17,10 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, HandOver, System
 
 
-@dataclass(frozen=True)
-class Copies:
-    """The copies of one task.
+class Copies(NamedTuple):
+    """The copies of one task, in their order."""
 
-    Attributes:
-        words: Words of the hand-over, in the control block of the first copy.
-        tasks: The copies in their order.
-    """
-
-    words: memoryview
+    words: memoryview  # control block of the first copy, with the words of the hand-over
     tasks: Sequence[ReleasedTask]
 
     @property
@@ -36,38 +30,34 @@ class Copies:
 
 
 class HandOverDirector:
-    """Requests hand-overs at the beginning of a tick, before any task is released.
-
-    Attributes:
-        groups: Tasks with standbys.
-    """
+    """Requests hand-overs at the beginning of a tick, before any task is released."""
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
         self._driver = driver
         self._is_lockstep = bool(segment.words[System.LOCKSTEP])
         tasks = {task.spec.name: task for task in driver.tasks}
-        boards = dict.fromkeys(t.board for t in segment.layout.tasks if t.role == "standby")
-        self.groups = [
-            Copies(
-                segment.get_block(board),
-                [tasks[copy.name] for copy in segment.layout.list_copies(board)],
+        layout = segment.layout
+        self._groups = {
+            board: Copies(
+                segment.get_block(board), [tasks[copy.name] for copy in layout.list_copies(board)]
             )
-            for board in boards
-        ]
+            for board in layout.replicated
+        }
 
     def check_active_copies(self) -> None:
         """Request a hand-over from each active copy that is lost or, in lockstep, has stopped."""
-        for group in self.groups:
+        for group in self._groups.values():
             if stray := group.words[Block.STRAYED]:
                 group.words[Block.STRAYED] = 0
                 self._take_out(group, group.tasks[(stray - 1) % len(group.tasks)])
-            active = group.active
-            if reason := self._find_reason(active):
-                self.hand_over(group, reason)
+            if reason := self._find_reason(group.active):
+                self._hand_over(group, reason)
 
     def _take_out(self, group: Copies, stray: ReleasedTask) -> None:
         """Mark a copy that has strayed as lost. The Rack then kills its process and restarts it."""
-        if stray.is_lost or (stray is group.active and not self.hand_over(group, HandOver.STRAYED)):
+        if stray.is_lost or (
+            stray is group.active and not self._hand_over(group, HandOver.STRAYED)
+        ):
             return
         tick = self._driver.words[System.TICK]
         stray.mark_lost(tick)
@@ -82,25 +72,28 @@ class HandOverDirector:
             return HandOver.NONE
         if active.is_stopped:
             return HandOver.STOPPED
-        is_late = active.block[Block.DONE] != active.block[Block.RELEASED]
-        return (
-            HandOver.LATE
-            if is_late and active.deadline <= self._driver.words[System.TICK]
-            else HandOver.NONE
-        )
+        is_due = active.deadline <= self._driver.words[System.TICK]
+        return HandOver.LATE if is_due and not _is_done(active) else HandOver.NONE
 
-    def hand_over(self, group: Copies, reason: HandOver) -> bool:
+    def _hand_over(self, group: Copies, reason: HandOver) -> bool:
         """Request a hand-over to a standby. In lockstep, wait until it is done.
 
         Args:
             group: Copies of the task.
-            reason: Reason for the hand-over.
+            reason: Reason for the hand-over. For an operator, only a copy that has the state of the
+                active one can take over.
 
         Returns:
             False if no standby can take over.
         """
-        standbys = [task for task in group.tasks if task is not group.active]
-        able = [task for task in standbys if self._is_able(task)]
+        able = [
+            task
+            for task in group.tasks
+            if task is not group.active
+            and not (task.is_lost or task.is_stopped)
+            and (_is_done(task) or not self._is_lockstep)
+            and (task.block[Block.ALIGNED] or reason != HandOver.COMMANDED)
+        ]
         if not able:
             return False
         # Of equal ones, this takes the first.
@@ -114,17 +107,15 @@ class HandOverDirector:
 
     def switch_copy(self, board: str) -> None:
         """Request a hand-over for an operator, if a standby has the state of the active copy."""
-        for group in self.groups:
-            aligned = [task for task in group.tasks if task.block[Block.ALIGNED] > 0]
-            if group.tasks[0].spec.name == board and any(map(self._is_able, aligned)):
-                self.hand_over(group, HandOver.COMMANDED)
-
-    def _is_able(self, task: ReleasedTask) -> bool:
-        """Return True if a copy can take over: it runs and, in lockstep, is not late."""
-        block = task.block
-        is_done = block[Block.DONE] == block[Block.RELEASED] or not self._is_lockstep
-        return not task.is_lost and not task.is_stopped and is_done
+        if board in self._groups:
+            self._hand_over(self._groups[board], HandOver.COMMANDED)
 
     def is_served(self, task: ReleasedTask) -> bool:
         """Return True if another copy does the work of a lost task."""
-        return any(task in group.tasks and not group.active.is_lost for group in self.groups)
+        group = self._groups.get(task.spec.board)
+        return group is not None and task in group.tasks and not group.active.is_lost
+
+
+def _is_done(task: ReleasedTask) -> bool:
+    """Return True if a task has finished its last release."""
+    return bool(task.block[Block.DONE] == task.block[Block.RELEASED])

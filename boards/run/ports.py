@@ -276,6 +276,8 @@ class OutputPorts:
     `Output.rests_on`). The response time of the system is measured from these ticks.
     """
 
+    open_writer = staticmethod(open_writer)
+
     def __init__(
         self,
         segment: Segment,
@@ -301,28 +303,24 @@ class OutputPorts:
             if port in level.outputs
         }
         self.writers = {port: self.open_writer(segment, name) for port, name in mailboxes.items()}
-        self._ports: list[OutputPort] = []
+        self.ports: list[OutputPort] = []
         for port, writer in self.writers.items():
             sources = [inputs.readers[name] for name in writer.spec.rests_on]
             output = OutputPort(segment, writer, alarms, sources, port in sent)
-            self._ports.append(output)
+            self.ports.append(output)
             level.store_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.read_queue_position(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)]
+        self._compiled = [port for port in self.ports if can_write(port.writer)]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
-        self._others = [port for port in self._ports if not can_write(port.writer)]
+        self._others = [port for port in self.ports if not can_write(port.writer)]
         self._is_faulty = False
-
-    def open_writer(self, segment: Segment, name: str) -> Writer:
-        """Open and claim a mailbox."""
-        return open_writer(segment, name)
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Set the active faults of all mailboxes. Each port applies those that concern it."""
-        for port in self._ports:
+        for port in self.ports:
             port.apply_faults(faults)
-        self._is_faulty = any(port.is_faulty for port in self._ports)
+        self._is_faulty = any(port.is_faulty for port in self.ports)
 
     @property
     def bus_errors(self) -> int:
@@ -339,7 +337,7 @@ class OutputPorts:
         Returns:
             False if a message was published too late.
         """
-        ports = self._ports
+        ports = self.ports
         if now is None and not self._is_faulty:
             ports = self._others
             if self._table.write(tick):
@@ -350,12 +348,12 @@ class OutputPorts:
             if not port.write(tick, now):
                 in_time = False
         if self._is_faulty:
-            self._is_faulty = any(port.is_faulty for port in self._ports)
+            self._is_faulty = any(port.is_faulty for port in self.ports)
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due. Call this in a cycle that writes nothing else."""
-        for port in self._ports:
+        for port in self.ports:
             port.flush_delayed(tick, now)
 
     @property

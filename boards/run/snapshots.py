@@ -12,6 +12,7 @@ import sys
 import time
 from functools import partial
 
+from rack.backplane.byte_lock import ProcessLock
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.copies import copy_memory
 from rack.backplane.segment import Segment
@@ -147,6 +148,8 @@ class ClockCopies:
         words = self._segment.words
         now_s = time.monotonic()
         if goes_on:
+            # A fork does not inherit the lock of the clock, without which a standby would run too.
+            ProcessLock(self._segment.fd, 8 * System.CLOCK_PID).take()
             words[System.CLOCK_PID] = os.getpid()
             words[System.EPOCH_NS] = time.monotonic_ns()
             words[System.STATE] = Run.RUNNING

@@ -28,7 +28,7 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
-from rack.backplane.words import Block, Demand, Run, System, is_switched_on
+from rack.backplane.words import Block, Demand, HandOver, Run, System, is_switched_on
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operator import build_hold_command, find_level
 from rack.boards.run.copying import Copier
@@ -77,7 +77,7 @@ class SystemController:
                 segment, driver.tasks, wiring.schedulings, driver.alarms
             )
         self._hand_overs: HandOverDirector | None = None
-        if any(task.role == "standby" for task in segment.layout.tasks):
+        if segment.layout.replicated:
             # Import it only in racks that have standbys.
             self._hand_overs = import_module(HAND_OVER).HandOverDirector(segment, driver)
             self._desk.hand_overs = self._hand_overs
@@ -378,6 +378,7 @@ def run_clock(
         copier: Forks the copies of the clock for snapshots. None if no snapshots are taken.
     """
     words = segment.words
+    was_run = words[System.CLOCK_PID] != 0
     words[System.CLOCK_PID] = os.getpid()
     alarms = AlarmWriter(segment, CLOCK, attention)
     if words[System.STATE] != Run.RUNNING:
@@ -386,6 +387,9 @@ def run_clock(
         now = SystemClock(segment).compute_tick()
         newest = words[System.TICK]
         alarms.raise_alarm(now, Alarm.REJOINED, value=now - newest, since=newest)
+        if was_run and wiring.copy is not None:
+            # A standby of the clock waits whenever the clock runs, so this is another copy.
+            alarms.raise_alarm(now, Alarm.TAKEN_OVER, -1 - wiring.copy, HandOver.LOST)
     end_of_run = EndOfRun(segment, wiring)
     driver: ClockDriver
     if wiring.lockstep:

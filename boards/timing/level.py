@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rack.backplane.layout import TickGrid
 from rack.backplane.words import Scheduler
 from rack.boards.timing.tasks import Budget
 
 Coupling = Literal["tight", "loose", "none"]
+
+
+class StandbyPlace(NamedTuple):
+    """Name, core and SCHED_FIFO priority of a standby."""
+
+    name: str
+    core: int
+    priority: int
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,7 @@ class BoardTiming:
         phase: Tick of the first release.
         scheduler: Scheduler of the executor.
         is_urgent: Whether maximum urgency first runs the executor before others.
+        standbys: Name, core and priority of each further copy of the executor.
         reads: Ticks at which it reads messages, keyed by the board that writes them. Boards whose
             messages it reads in every cycle are left out.
     """
@@ -60,6 +69,7 @@ class BoardTiming:
     phase: int
     scheduler: Scheduler
     is_urgent: bool
+    standbys: tuple[StandbyPlace, ...]
     reads: Mapping[str, TickGrid]
 
     @property

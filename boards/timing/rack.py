@@ -231,7 +231,7 @@ class RackTiming:
     def _build_board_tasks(
         self, board: BoardTiming, taken_ns: Mapping[str, int]
     ) -> list[TimedTask]:
-        """Return the executor and any planner of a board. Empty without a budget."""
+        """Return the executor, standbys and planner of a board. Empty without a budget."""
         budget = board.budget
         if budget is None:
             return []
@@ -253,8 +253,10 @@ class RackTiming:
                 Part(Unit.WRITE, budget.write_ns),
             ),
         )
+        # Whichever copy is active, each one runs the whole cycle.
+        executors = [executor, *(replace(executor, **s._asdict()) for s in board.standbys)]
         if not board.has_planner:
-            return [executor]
+            return executors
         ceiling = board.priority if board.is_critical else 0
         planner = replace(
             executor,
@@ -271,7 +273,7 @@ class RackTiming:
             scheduler=Scheduler.FIXED_PRIORITY,
             ceiling=ceiling,
         )
-        return [executor, planner]
+        return [*executors, planner]
 
     @cached_property
     def cores(self) -> dict[str, int]:
@@ -279,6 +281,7 @@ class RackTiming:
         cores = {self.clock.name: self.clock.core}
         for board in self.boards.values():
             cores[board.name] = board.core
+            cores |= {standby.name: standby.core for standby in board.standbys}
             if board.has_planner:
                 cores[f"{board.name}.planner"] = board.planner_core
         return cores

@@ -171,9 +171,7 @@ class ArmDriver(Executor):
     def realign(self, state: Message) -> None:
         """Continue the simulation and the estimates from a state of the active copy."""
         assert isinstance(state, ArmState), "the port `state`"
-        self.arm.restore(state)
-        self.sensors.restore_estimate(state)
-        self.stopping.restore_state(state)
+        self.enabling.restore_arm(state)
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults that are injected between this level and the arm."""

@@ -63,14 +63,17 @@ class Enabling:
         self.is_started = True
         self._restarted = before.has_message
         if self._restarted:
-            state = before.message
-            self._arm.restore(state)
-            self._sensors.restore_estimate(state)
-            self._stopping.restore_state(state)
+            self.restore_arm(before.message)
             self.is_taken_over = self.is_enabled
         elif self._at_start and not self._guessed:
             self._arm.enable()
         return self._restarted
+
+    def restore_arm(self, state: ArmState) -> None:
+        """Let arm, sensors and stopping continue from a state."""
+        self._arm.restore(state)
+        self._sensors.restore_estimate(state)
+        self._stopping.restore_state(state)
 
     def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
         """Adopt the sensed pose unless the arm is taken over.

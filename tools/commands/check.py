@@ -172,8 +172,6 @@ def check(
 def _list_uncounted(name: str, config: RackConfig) -> dict[str, str]:
     """Return a dictionary from what a check of one config cannot count to the reason."""
     uncounted = dict.fromkeys(config.host, "a host board has no rate")
-    copies = (place.name for place in config.list_standbys())
-    uncounted |= dict.fromkeys(copies, "the timing model has no standbys")
     table = config.adapter.lan
     if table is not None and table.imports:
         partners = [name_config(path) for path in (*table.launch, *table.partners)]

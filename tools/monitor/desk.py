@@ -104,14 +104,13 @@ class LevelCommander:
             entry = OperatorTable(segment).add_request(clock_request)
             text = describe_command(copy_request_message(entry, segment.layout))
             return Reply(0, command.level, text, -1, "waiting", waits=wait_text)
-        hand_overs = self._count_hand_overs(command.level)
         # On any exit from the context, a request that has not been given is withdrawn.
         with OperatorTable(segment).claim_request(clock_request) as entry:
             reply = self._await_given(entry, command.level)
         if command.operation is Operation.SCHEDULE:
             return self._check_scheduler(reply, command.name or "")
         if command.operation is Operation.SWITCH:
-            return self._check_hand_over(reply, hand_overs)
+            return self._check_hand_over(reply)
         return self._await_reply(reply, wait, timeout_s)
 
     def lease_command(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
@@ -238,22 +237,12 @@ class LevelCommander:
             reply, fate="refused", objection=f"still {now}; see the event for the reason"
         )
 
-    def _count_hand_overs(self, level: str) -> int:
-        """Return how often a standby has taken over from the executor of a level."""
-        blocks = self._segment.map.blocks
-        return self._segment.get_block(level)[Block.HAND_OVERS] if level in blocks else 0
-
-    def _check_hand_over(self, reply: Reply, before: int) -> Reply:
-        """Wait until a standby has taken over, and return the reply of the clock.
-
-        Args:
-            reply: Reply to the command, which the clock has given.
-            before: Number of hand-overs before the command.
-        """
+    def _check_hand_over(self, reply: Reply) -> Reply:
+        """Wait until a standby has taken over, and return the reply of the clock."""
         words = self._segment.get_block(reply.level)
         for is_over in self._poll_run(reply.line, "the standby"):
-            if words[Block.HAND_OVERS] != before:
-                since = words[Block.ACTIVE_SINCE]
+            since = words[Block.ACTIVE_SINCE]
+            if words[Block.HAND_OVERS] and since >= reply.given:
                 return replace(reply, fate="done", taken_up=since, done=since)
             if is_over or not words[Block.TAKE_OVER]:
                 break

@@ -70,6 +70,7 @@ def list_facts(report: RunReport) -> Iterator[Row]:
     yield from _list_outcome(report)
     brakings = [Braking(**braking) for braking in outcome["brakings"]]
     yield "brakes", [format_brakings(brakings).removeprefix("brakes ")] if brakings else []
+    yield "standbys", [_format_active_copy(**copy) for copy in report.standbys or ()]
     if report.faults is not None:
         yield "faults", _list_fault_clauses(report.faults, report.unexplained)
     holds = [
@@ -106,6 +107,16 @@ def _list_outcome(report: RunReport) -> Iterator[Row]:
         if "touches" in found and not any(found[key] for key in COUNT_TEXTS):
             clauses.append("no contact, no limit reached")
         yield name, clauses
+
+
+def _format_active_copy(
+    active: str, since_tick: int, since_s: float, why: str, hand_overs: int, **_: object
+) -> str:
+    """Format an entry of `RunReport.standbys` as a clause."""
+    if not hand_overs:
+        return f"{active} active throughout"
+    times = f", after {hand_overs} hand-overs" if hand_overs > 1 else ""
+    return f"{active} active since {since_s:g} s (tick {since_tick}){times}: {why}"
 
 
 def _list_fault_clauses(

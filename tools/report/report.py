@@ -116,6 +116,7 @@ def build_report(recording: Recording) -> Document:
         holds=list_holds(recording),
         state_tables=list_fired_rows(recording),
         **report_faults(recording.events, layout),
+        standbys=summarize_standbys(recording),
         system_response=response,
         data_ages=summarize_data_ages(recording),
         entries=_summarize_entries(recording),
@@ -130,6 +131,25 @@ def build_report(recording: Recording) -> Document:
         recording=ended.get("recording", "without the end of the run"),
         **summarize_gaps(recording),
     ).to_document()
+
+
+def summarize_standbys(recording: Recording) -> list[Document]:
+    """Return the active copy of each task with standbys at the end, since when, and why."""
+    since: Document = {"since_tick": 0, "since_s": 0.0, "why": "", "hand_overs": 0}
+    found = {task: {"task": task, "active": task, **since} for task in recording.layout.replicated}
+    # A run that continues another one also has hand-overs of that one.
+    for event in (*recording.end_counts.get("earlier", ()), *recording.events):
+        if event.get("code") == "taken_over":
+            task = event["subject"].partition(".")[0]
+            found[task] = {
+                "task": task,
+                "active": event["subject"],
+                "since_tick": event["tick"],
+                "since_s": event["tick"] * recording.layout.clock_ns * 1e-9,
+                "why": event["text"].partition(": ")[2],
+                "hand_overs": found.get(task, since)["hand_overs"] + 1,
+            }
+    return [*found.values()]
 
 
 def build_unrecorded_report(config: RackConfig, ended: Mapping[str, Any]) -> Document:

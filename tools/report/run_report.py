@@ -55,6 +55,7 @@ class RunReport:
     faults: Any = None
     unexplained: Any = None
     restarts: Any = None
+    standbys: Any = None
     tasks: Any = None
     system_response: Any = None
     data_ages: Any = None

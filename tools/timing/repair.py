@@ -192,8 +192,8 @@ def _list_loose_couplings(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings that couple the board's planner loosely, one for each core it could use."""
     slot = rack.config.board[board].planner_slot
     if slot is None:
-        tables = rack.config.board.values()
-        taken = {slot for table in tables for slot in (table.slot, table.planner_slot)}
+        config = rack.config
+        taken = {place.slot for place in (*config.list_tasks(), *config.list_standbys())}
         free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
         slot = next(free, None)
     if rack.timing.build_level(board).within_cycles is not None and slot is not None:

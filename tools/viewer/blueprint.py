@@ -196,7 +196,7 @@ class RackViews:
     def _build_event_lanes(self) -> rrb.Container | rrb.View:
         """Return views of the events of all boards in the whole run."""
         names = (*self._names.values(), *self._config.host, "clock", RACK_LANE)
-        lanes = [([self.build_path(EVENTS, name)], 1) for name in names]
+        lanes = [([self.build_query(EVENTS, name)], 1) for name in names]
         return _build_lane_columns("events", lanes)
 
     def _build_cycle_lanes(self) -> rrb.Container | rrb.View:

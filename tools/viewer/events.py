@@ -1,6 +1,7 @@
 """Writes a rack's events as log lines and lanes, and the recorder's lost rows as log lines.
 
-The lane of a board shows the kind of the board's last event, until the next event.
+The lane of a board shows the kind of the board's last event, until the next event. A second lane
+of a board with a standby shows which copy is active.
 """
 
 from __future__ import annotations
@@ -84,6 +85,10 @@ class EventWriter:
         self._stream.log_line(when, "events", text, LOG_LEVELS.get(event.kind, "INFO"))
         if event.kind not in KINDS_WITHOUT_LANE:
             self._write_lane(when, board, event)
+        if event.code in ("active", "taken_over"):
+            task = event.subject.partition(".")[0]
+            lane = (EVENTS, self._names.get(task, task), "active")
+            write_span(self._stream, when, lane, event.subject)
         if self._marks is not None:
             self._marks.mark_event(when, event)
         lost = board if event.kind == "died" else event.subject if event.code == "hang" else ""

@@ -57,10 +57,10 @@ class CycleLane:
         self, stream: Stream, task: TaskSpec, board: str, speed: float, lockstep: bool
     ) -> None:
         self._stream = stream
-        self._lane = (BOARDS, board, task.role)
+        self._lane = (BOARDS, board, task.name.partition(".")[2] or task.role)
         self._every = task.every
         self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
-        self._work = "process" if task.role == "executor" else "plan"
+        self._work = "plan" if task.role == "planner" else "process"
         self._speed = speed
         self._lockstep = lockstep
         # Ticks of the cycles in the newest block, and the last one before it; and their ends in ns.

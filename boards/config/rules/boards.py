@@ -145,21 +145,19 @@ def check_circles(wiring: Wiring) -> Mistakes:
 
 def check_slots(wiring: Wiring) -> Mistakes:
     """Check that no two boards have the same slot."""
+    config = wiring.config
+    slots = [
+        (f"board.{name}.{key}", slot)
+        for name, board in config.board.items()
+        for key, slot in (("slot", board.slot), ("planner_slot", board.planner_slot))
+    ]
     taken: dict[int, str] = {}
-    if (clock := wiring.config.clock.standby) is not None:
-        taken[clock.slot] = "clock.standby.slot"
-    for name, board in wiring.config.board.items():
-        standbys = [
-            (f"standby[{number}].slot" if len(board.standby) > 1 else "standby.slot", copy.slot)
-            for number, copy in enumerate(board.standby)
-        ]
-        slots = (("slot", board.slot), ("planner_slot", board.planner_slot), *standbys)
-        for key, slot in slots:
-            place = f"board.{name}.{key}"
-            if slot is not None and slot in taken:
-                yield Mistake(place, slot, f"the slot is already taken by {taken[slot]}")
-            elif slot is not None:
-                taken[slot] = place
+    standbys = [(f"{place}.slot", standby.slot) for place, standby in config.list_standby_tables()]
+    for place, slot in (*slots, *standbys):
+        if slot is not None and slot in taken:
+            yield Mistake(place, slot, f"the slot is already taken by {taken[slot]}")
+        elif slot is not None:
+            taken[slot] = place
 
 
 def check_run_end(wiring: Wiring) -> Mistakes:

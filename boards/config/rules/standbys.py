@@ -20,18 +20,10 @@ def check_standbys(wiring: Wiring) -> Mistakes:
     """Check that each standby has a core of this machine, and that its level can be replicated."""
     config = wiring.config
     cores = sorted(os.sched_getaffinity(0))
-    places = {
-        f"{place}.standby{f'[{number}]' if len(standbys) > 1 else ''}.core": standby.core
-        for place, standbys in (
-            ("clock", () if config.clock.standby is None else (config.clock.standby,)),
-            *((f"board.{name}", board.standby) for name, board in config.board.items()),
-        )
-        for number, standby in enumerate(standbys)
-    }
-    for place, core in places.items():
-        if core not in cores:
+    for place, standby in config.list_standby_tables():
+        if standby.core not in cores:
             why = f"this machine has no such core; cores: {', '.join(map(str, cores))}"
-            yield Mistake(place, core, why)
+            yield Mistake(f"{place}.core", standby.core, why)
     executors = {p.task: p for p in wiring.tasks if issubclass(p.kind, Executor)}
     for name, board in config.board.items():
         place = f"board.{name}"

@@ -7,13 +7,14 @@ import json
 import os
 import random
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rack.backplane.process import is_alive, list_children, wait_readable
+from rack.backplane.standby import list_standbys
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
@@ -23,8 +24,9 @@ from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.wiring import Continuation, SnapshotPolicy
-from tests.boards.conftest import LOOSE, MakeConfig
+from tests.boards.conftest import LOOSE, PLANNED, MakeConfig
 from tests.boards.remembering_racks import REMEMBERING
+from tests.boards.runs import kill
 from tests.processes import BOUND_S, FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
@@ -79,7 +81,7 @@ def ticks_on(crate: WarmCrate) -> list[int]:
     return [tick for tick in found[::-1] if tick >= 0]
 
 
-def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
+def faulty(config: RackConfig, *faults: Mapping[str, Any]) -> RackConfig:
     """Return the config with these faults."""
     return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
 
@@ -97,6 +99,52 @@ def test_a_run_continues_from_each_snapshot_to_the_same_digest(
     for tick in (*ticks[::-1], ticks[3], 399):
         again = continued(rack, crate, tick)
         assert (again.digest, again.ticks) == (expected.digest, expected.ticks), tick
+
+
+LOST_AT = 150
+BACK_AT = 220
+BOARD = "board.wave.standby={slot=9,core=0}"
+BOTH = (BOARD, "board.watch.standby={slot=10,core=1}")
+CLOCK = "clock.standby={slot=11,core=0}"
+STANDBYS: Mapping[str, tuple[Sequence[str], Sequence[Mapping[str, Any]], int]] = {
+    "board": ((BOARD,), (), 0),
+    "board, killed": ((BOARD,), (kill("wave", LOST_AT),), 1),
+    "board, hanging": ((BOARD,), ({"kind": "hang", "board": "wave", "tick": LOST_AT},), 1),
+    "board, both killed": (
+        (BOARD,),
+        (kill("wave", LOST_AT), kill("wave.standby", BACK_AT + 50)),
+        2,
+    ),
+    "two boards, killed": (BOTH, (kill("wave", LOST_AT), kill("watch", LOST_AT)), 2),
+    "clock": ((CLOCK,), (), 0),
+    "clock, killed": ((CLOCK,), (kill("clock", LOST_AT),), 0),
+    "clock and board, both killed": (
+        (CLOCK, BOARD),
+        (kill("clock", LOST_AT), kill("wave", LOST_AT + 10)),
+        1,
+    ),
+}
+"""Standbys, faults, and the number of hand-overs of boards in the whole run."""
+
+
+@pytest.mark.parametrize("case", STANDBYS)
+def test_a_rack_with_a_standby_continues_to_the_digest_of_the_original(
+    config: MakeConfig, crate: WarmCrate, case: str
+) -> None:
+    standbys, faults, hand_overs = STANDBYS[case]
+    with Rack(config(text=PLANNED)) as plain:
+        expected = plain.run(SECONDS).digest
+    rack = faulty(config(*standbys, "supervision.lockstep_restart_s=0.05", text=PLANNED), *faults)
+    ticks = (0, LOST_AT - 1, LOST_AT, LOST_AT + 1, BACK_AT, 350)
+    assert taken_at(rack, crate, *ticks).digest == expected
+    # A snapshot that is due while a copy is lost is taken once it is back.
+    assert {0, LOST_AT - 1, BACK_AT, 350} <= {*ticks_on(crate)}
+    for tick in ticks[::-1]:
+        begins = Continuation(tick, faults=len(rack.fault))
+        with Rack(rack, crate=crate, continues=begins) as again:
+            assert again.run(SECONDS).digest == expected, tick
+            found = sum(task.hand_overs for task in list_standbys(again.segment))
+        assert found == hand_overs, tick
 
 
 @pytest.mark.parametrize(

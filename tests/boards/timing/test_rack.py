@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.words import Scheduler
 from rack.boards.timing.chains import format_names
 from rack.boards.timing.forecast import NO_BUDGET, Forecast
-from rack.boards.timing.level import BoardTiming
+from rack.boards.timing.level import BoardTiming, StandbyPlace
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 from rack.boards.timing.verdicts import evaluate_rack
@@ -36,6 +36,7 @@ FIGURE_3 = BoardTiming(
     phase=0,
     scheduler=Scheduler.FIXED_PRIORITY,
     is_urgent=False,
+    standbys=(),
     reads={},
 )
 
@@ -55,6 +56,18 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
     # The paper's own way out: cycles of 8 ms, figure 2.
     longer = rack(FIGURE_3).replace_board("level", every=4, within_cycles=2)
     assert all(verdict.holds for verdict in evaluate_rack(longer))
+
+
+def test_a_standby_is_one_more_executor_on_its_core() -> None:
+    place = StandbyPlace("level.standby", 0, 70)
+    alone = rack(FIGURE_3)
+    doubled = alone.replace_board("level", standbys=(place,))
+    executor, standby = (
+        next(task for task in doubled.tasks if task.name == name) for name in ("level", place.name)
+    )
+    assert standby == replace(executor, name=place.name, core=0, priority=70)
+    assert doubled.cores[place.name] == 0
+    assert doubled.loads == alone.loads | {0: standby.cost_ns / standby.every_ns}
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:

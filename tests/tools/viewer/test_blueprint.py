@@ -132,7 +132,7 @@ def test_no_lane_is_cut_off_and_higher_boards_are_above_lower_ones(name: str | P
     assert by_title["levels, whole run"][: len(numbered)] == [
         f"/levels/{lane}/**" for lane in numbered
     ]
-    assert by_title["events"][: len(names)] == [f"/events/{lane}" for lane in names.values()]
+    assert by_title["events"][: len(names)] == [f"/events/{lane}/**" for lane in names.values()]
     ranks = build_rack_timing(config, layout).ranks
     assert [lane.partition("-")[2] for lane in numbered][: sum(map(len, ranks))] == [
         board for rank in ranks for board in rank

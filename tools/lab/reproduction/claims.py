@@ -12,6 +12,7 @@ from functools import partial
 from rack.tools.lab.reproduction import predictions, rules
 from rack.tools.lab.reproduction.experiments import (
     partition,
+    replication,
     response,
     sharing,
     smoothness,
@@ -126,8 +127,8 @@ SECTIONS = (
                 "replication",
                 "Reliability through replication",
                 "... reliability through replication ...",
-                "",
-                (),
+                "A standby replaced a lost servo level without a missing message or torque.",
+                (replication.REPLICATION,),
                 rules.judge_replication,
             ),
             PaperClaim(

@@ -27,6 +27,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
     NasremRun,
 )
 from rack.tools.lab.reproduction.experiments.partition import Partition, PartitionFigures
+from rack.tools.lab.reproduction.experiments.replication import ReplicationRun
 from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.smoothness import (
@@ -182,9 +183,19 @@ def judge_pipeline(chains: Chains) -> ClaimVerdict:
     )
 
 
-def judge_replication() -> ClaimVerdict:
-    """Return the ruling "untestable", because no experiment replaces a board with a replica."""
-    return rule_on(needs=[compare_value("replicas", 0, ">=", 1)])
+def judge_replication(run: ReplicationRun) -> ClaimVerdict:
+    """Check that with a standby the loss of a moving arm's servo level changes no message."""
+    lost = run.replicated
+    return rule_on(
+        compare_value("hand_overs", lost.hand_overs, "=", 1),
+        *check_none(
+            ticks_without_torque=lost.ticks_without_torque,
+            brakings=lost.brakings,
+            messages_missing=lost.messages_missing,
+            digests_that_differ=lost.digest != run.undisturbed.digest,
+        ),
+        needs=[compare_value("ticks_without_torque_alone", run.alone.ticks_without_torque, ">", 0)],
+    )
 
 
 def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:

@@ -28,6 +28,7 @@ from rack.tools.lab.reproduction.experiments.partition import (
     PartitionFigures,
     TaskFigures,
 )
+from rack.tools.lab.reproduction.experiments.replication import LossRun, ReplicationRun
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
 from rack.tools.lab.reproduction.experiments.smoothness import MotionPoint, SmoothnessRun
 from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
@@ -217,6 +218,12 @@ def moved(value: float, error_mrad: float, jerk: float, brakings: int) -> Motion
 
 
 STILL = moved(0.0, 0.3, 60.0, 0)
+REPLACED = LossRun("7b", 0, 0, 0, 1)
+REPLICATED = ReplicationRun(
+    undisturbed=replace(REPLACED, hand_overs=0),
+    alone=LossRun("c7", 200, 1, 200, 0),
+    replicated=REPLACED,
+)
 SMOOTH = SmoothnessRun(
     STILL,
     jitter=(moved(0.05, 0.4, 66.0, 0), moved(0.4, 0.7, 360.0, 5)),
@@ -304,7 +311,18 @@ RULINGS = [
     ("equation-3.3", [RUN], HOLDS),
     ("equation-3.3", [response("task missed 1 cycle")], BOUNDED),
     ("equation-3.3", [response("task: waited")], FAILS),
-    ("replication", [], Ruling.UNTESTABLE),
+    ("replication", [REPLICATED], HOLDS),
+    *(
+        ("replication", [replace(REPLICATED, replicated=replace(REPLACED, **change))], FAILS)
+        for change in (
+            {"hand_overs": 0},
+            {"ticks_without_torque": 1},
+            {"brakings": 1},
+            {"messages_missing": 1},
+            {"digest": "c7"},
+        )
+    ),
+    ("replication", [replace(REPLICATED, alone=REPLACED)], Ruling.UNTESTABLE),
 ]
 
 
