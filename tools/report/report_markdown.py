@@ -182,7 +182,12 @@ def _format_responses(chains: Sequence[Document]) -> Blocks:
             if levels := chain[direction]["levels"]:
                 way = {"way": f"{direction}, {levels[0]} to {levels[-1]}"}
                 bounds = {key: chain[key] for key in ("bound_eq_3_2_ms", "sum_eq_3_3_ms")}
-                rows.append(way | chain[direction] | bounds | {"levels": None, "beyond": None})
+                rows.append(
+                    way
+                    | chain[direction]
+                    | bounds
+                    | {"levels": None, "beyond": None, "count": None, "parts": None}
+                )
                 beyond += [way | slow for slow in chain[direction]["beyond"]]
     yield from _format_section("System response, ms of simulated time", rows)
     beyond.sort(key=lambda slow: -slow["ms"])
