@@ -8,7 +8,7 @@ simulated time, because each rack has its own ticks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -228,7 +228,8 @@ class JoinedRacks:
             self.compute_response_ns(stations),
             *self.compute_bounds_ns(stations),
         )
-        return JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns), before)
+        path = JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns))
+        return replace(path, before=before)
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[RackLink] | None:
         """Return the links that information crosses on its way along `stations`.

@@ -63,12 +63,14 @@ class ChainResponses(NamedTuple):
         beyond: Entries for those that exceed the bound.
         unseen: Number of responses that could not be measured.
         parts: Times of the longest response in ms, by rack and link. Empty within one rack.
+        uncertainty_ms: Largest error of the responses.
     """
 
     times_ms: np.ndarray
     beyond: list[Document]
     unseen: int
     parts: dict[str, float]
+    uncertainty_ms: float
 
 
 def measure_direction(
@@ -99,6 +101,7 @@ def measure_direction(
         "beyond": beyond,
         "unseen": sum(each.unseen for each in measured),
         "count": len(longest.times_ms) if longest else 0,
+        "uncertainty_ms": longest.uncertainty_ms if longest else 0.0,
         "parts": longest.parts if longest else {},
     }
 
@@ -139,10 +142,10 @@ def _measure_chain(recording: Recording, chain: BoardChain, bound_ms: float) -> 
         # The first message with the information may be among the unrecorded ones.
         gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
         is_seen = gaps[at[1:]] == gaps[at[:-1]]
-    limit_ms = bound_ms + tick_ms / 2
+    uncertainty_ms = origins.uncertainty_ms if origins else 0.0
+    limit_ms = bound_ms + uncertainty_ms + tick_ms / 2
     parts: dict[str, float] = {}
     if origins is not None:
-        limit_ms += origins.uncertainty_ms
         is_seen &= np.diff(origins.gaps[messages]) == 0
         if is_seen.any():
             longest = int((ms * is_seen).argmax())
@@ -160,7 +163,8 @@ def _measure_chain(recording: Recording, chain: BoardChain, bound_ms: float) -> 
         }
         for k in np.flatnonzero(is_seen & (ms > limit_ms))
     ]
-    return ChainResponses(ms[is_seen], beyond, int(np.count_nonzero(~is_seen)), parts)
+    unseen = int(np.count_nonzero(~is_seen))
+    return ChainResponses(ms[is_seen], beyond, unseen, parts, uncertainty_ms)
 
 
 def list_delays(
@@ -203,6 +207,7 @@ NOT_MEASURED: Document = {
     "beyond": [],
     "unseen": 0,
     "count": 0,
+    "uncertainty_ms": 0.0,
     "parts": {},
 }
 """Response in a direction that is not measured along these boards."""

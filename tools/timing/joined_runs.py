@@ -2,14 +2,15 @@
 
 The status of an adapter contains the serial of each message that it imported, which finds the
 message in the recording of the rack that wrote it. Its ticks are converted to the importing rack by
-the recorded clock comparisons. A response exceeds its bound only if it is longer by more than their
-uncertainty.
+the recorded clock comparisons. A bound is exceeded, or held, only if that is certain despite the
+uncertainty of these comparisons.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from rack.tools.timing.measured_response import (
 
 MAX_CAUSES = 5
 """Largest number of different causes that the text lists for a path."""
+MARKS = {True: "", False: "FAILS: ", None: "undecided: "}
 
 
 def measure_joined_runs(recordings: Sequence[Recording]) -> list[Document]:
@@ -54,62 +56,85 @@ def measure_joined_runs(recordings: Sequence[Recording]) -> list[Document]:
                 2,
             )
     judge_joined_racks(joined)
-
-    def refine(
-        recording: Recording, path: JoinedPath, messages: ImportedMessages
-    ) -> ImportedMessages:
-        """Complete imported messages by what the recording of the rack that wrote them shows."""
-        rack, _ = path.stations[-1 - len(path.boards)]
-        other = runs[rack]
-        messages, sent = _match_messages(recording, path.port, messages, other)
-        place = align_racks([recording, other])[1]
-        uncertainty_ns = place.uncertainty_ns * place.grid.clock_ns / place.grid.period_ns
-        arrived = sent["basis"]
-        parts: Mapping[str, np.ndarray] = {}
-        origins = None
-        if path.before is not None:
-            origins = find_origins(other, path.before, refine)
-            # The first messages depend on no message of the farther rack.
-            is_known = np.isin(arrived, origins.basis)
-            messages, sent = messages.select(is_known), sent[is_known]
-            at = np.searchsorted(origins.basis, sent["basis"])
-            arrived = origins.arrived[at]
-            parts = {name: times_ms[at] for name, times_ms in origins.parts.items()}
-            messages = messages._replace(gaps=messages.gaps + origins.gaps[at])
-            uncertainty_ns += origins.uncertainty_ms * 1e6
-
-        def convert(ticks: np.ndarray) -> np.ndarray:
-            """Convert ticks of the other rack to ticks of this rack."""
-            times_ns = np.rint(ticks * other.layout.clock_ns).astype(np.int64)
-            return (
-                place.convert_ticks(np.zeros_like(times_ns), times_ns) / recording.layout.clock_ns
-            )
-
-        def list_far_delays(previous: int, at: int) -> Iterator[str]:
-            """Yield a text for each cause of delay in other racks."""
-            boards = [board for name, board in path.stations if name == rack]
-            span = int(sent["basis"][previous]), int(sent["tick"][at]) + 1
-            yield from (f"{rack}: {text}" for text in list_delays(other, [*boards, ADAPTER], *span))
-            if origins is not None:
-                yield from origins.list_delays(arrived[previous], arrived[at])
-
-        return messages._replace(
-            written=convert(sent["tick"]),
-            arrived=convert(arrived),
-            parts=parts,
-            uncertainty_ms=uncertainty_ns * 1e-6,
-            list_delays=list_far_delays,
+    return [
+        _describe_direction(way, document[way])
+        for rack, recording in runs.items()
+        for document in measure_joined_responses(
+            recording, joined.list_paths(rack, is_whole=True), partial(_complete_messages, runs)
         )
+        for way in ("command", "status")
+        if document[way]["levels"]
+    ]
 
-    documents: list[Document] = []
-    for rack, recording in runs.items():
-        paths = joined.list_paths(rack, is_whole=True)
-        for one in measure_joined_responses(recording, paths, refine):
-            (way,) = (way for way in ("command", "status") if one[way]["levels"])
-            # Responses along parallel paths begin together. One of them stands for the others.
-            beyond = {entry["tick"]: entry for entry in one[way]["beyond"]}
-            documents.append({"direction": way, **one[way], "beyond": [*beyond.values()]})
-    return documents
+
+def _describe_direction(direction: str, measured: Document) -> Document:
+    """Return the responses in one direction with a verdict that allows for the uncertainty."""
+    times = measured["measured_ms"]
+    latest_ms = times["max"] + measured["uncertainty_ms"] if times else 0.0
+    # Responses along parallel paths begin together. One of them stands for the others.
+    beyond = {entry["tick"]: entry for entry in measured["beyond"]}
+    holds = measured["holds"]
+    if holds and latest_ms > measured["bound_ms"] + 1e-6:
+        holds = None
+    return {"direction": direction, **measured, "holds": holds, "beyond": [*beyond.values()]}
+
+
+def _complete_messages(
+    runs: Mapping[str, Recording],
+    recording: Recording,
+    path: JoinedPath,
+    messages: ImportedMessages,
+) -> ImportedMessages:
+    """Complete imported messages by what the recording of the rack that wrote them shows.
+
+    Args:
+        runs: Recordings of all racks by name.
+        recording: Recording of the rack that imported the messages.
+        path: Path on which they arrived.
+        messages: The messages.
+
+    Raises:
+        Failure: The other rack wrote none of them, or other ones.
+    """
+    rack, _ = path.stations[-1 - len(path.boards)]
+    other = runs[rack]
+    place = align_racks([recording, other])[1]
+    messages, sent = _match_messages(recording, path.port, messages, other)
+    uncertainty_ns = place.uncertainty_ns * place.grid.clock_ns / place.grid.period_ns
+    arrived = sent["basis"]
+    parts: Mapping[str, np.ndarray] = {}
+    origins = None
+    if path.before is not None:
+        origins = find_origins(other, path.before, partial(_complete_messages, runs))
+        # The first messages depend on no message of the farther rack.
+        is_known = np.isin(arrived, origins.basis)
+        messages, sent = messages.select(is_known), sent[is_known]
+        at = np.searchsorted(origins.basis, sent["basis"])
+        messages = messages._replace(gaps=messages.gaps + origins.gaps[at])
+        arrived = origins.arrived[at]
+        parts = {name: times_ms[at] for name, times_ms in origins.parts.items()}
+        uncertainty_ns += origins.uncertainty_ms * 1e6
+
+    def convert(ticks: np.ndarray) -> np.ndarray:
+        """Convert ticks of the other rack to ticks of this rack."""
+        times_ns = np.rint(ticks * other.layout.clock_ns).astype(np.int64)
+        return place.convert_ticks(np.zeros_like(times_ns), times_ns) / recording.layout.clock_ns
+
+    def list_far_delays(previous: int, at: int) -> Iterator[str]:
+        """Yield a text for each cause of delay in other racks."""
+        boards = [board for name, board in path.stations if name == rack]
+        span = int(sent["basis"][previous]), int(sent["tick"][at]) + 1
+        yield from (f"{rack}: {text}" for text in list_delays(other, [*boards, ADAPTER], *span))
+        if origins is not None:
+            yield from origins.list_delays(arrived[previous], arrived[at])
+
+    return messages._replace(
+        written=convert(sent["tick"]),
+        arrived=convert(arrived),
+        parts=parts,
+        uncertainty_ms=uncertainty_ns * 1e-6,
+        list_delays=list_far_delays,
+    )
 
 
 def _match_messages(
@@ -129,9 +154,9 @@ def _match_messages(
     )
     sent = sent[np.searchsorted(sent["serial"], messages.serials)]
     got = got[np.searchsorted(got["tick"], messages.taken)]
-    fields = got["message"].dtype.names
     if not len(sent) or any(
-        sent["message"][name].tobytes() != got["message"][name].tobytes() for name in fields
+        sent["message"][name].tobytes() != got["message"][name].tobytes()
+        for name in got["message"].dtype.names or ()
     ):
         raise Failure(
             f"{recording.folder} and {other.folder} are not of the same run: they have no message"
@@ -143,19 +168,30 @@ def _match_messages(
 
 def format_joined_runs(documents: Sequence[Document]) -> Iterator[str]:
     """Yield the verdict on the responses across racks, and lines for each group of paths."""
-    failing = sum(one["holds"] is False for one in documents)
-    yield (f"across racks: {len(documents) - failing} of {len(documents)} responses held")
+    judged = [one for one in documents if one["count"]]
+    counts = Counter(one["holds"] for one in judged)
+    more = [f"{counts[key]} {word}" for key, word in ((False, "failed"), (None, "undecided"))]
+    held = f"{counts[True]} of {len(judged)} responses held their bounds"
+    yield ", ".join([f"across racks: {held}", *(text for text in more if text[0] != "0")])
     for one in documents:
-        times = one["measured_ms"]
-        longest = f"at most {times['max']:g} ms" if times else "not measured"
+        levels = " > ".join(one["levels"])
+        if not one["count"]:
+            yield f"  not measured: {one['direction']} {levels}"
+            continue
+        within = f" +- {one['uncertainty_ms']:.2g}" * (one["uncertainty_ms"] > 0.0)
         yield (
-            f"  {'FAILS: ' * (one['holds'] is False)}{one['direction']} {longest}, bound"
-            f" {one['bound_ms']:g} ms, {one['count']} measured"
+            f"  {MARKS[one['holds']]}{one['direction']}: at most"
+            f" {one['measured_ms']['max']:.4g}{within} ms, bound {one['bound_ms']:g} ms;"
+            f" {one['count']} measured, {len(one['beyond'])} beyond"
         )
-        yield f"    {' > '.join(one['levels'])}"
-        if one["parts"]:
-            part = max(one["parts"], key=one["parts"].__getitem__)
-            parts = ", ".join(f"{name} {ms:.4g}" for name, ms in one["parts"].items())
-            yield f"    longest in {part}: {parts} ms"
-        causes = Counter(c for e in one["beyond"] for c in (*e["network"], *e["delayed_by"]))
+        yield f"    {levels}"
+        parts = one["parts"]
+        shares = ", ".join(f"{name} {ms:.4g}" for name, ms in parts.items())
+        yield f"    longest in {max(parts, key=parts.__getitem__)}: {shares} ms"
+        rack = one["levels"][-1].partition("/")[0]
+        causes = Counter(
+            cause
+            for entry in one["beyond"]
+            for cause in (*entry["network"], *(f"{rack}: {text}" for text in entry["delayed_by"]))
+        )
         yield from (f"    {count}: {cause}" for cause, count in causes.most_common(MAX_CAUSES))

@@ -29,7 +29,6 @@ from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.chain_response import NOT_MEASURED, BoardChain, Origins, measure_direction
 
-
 LOSSES = {
     "missing": "were lost before it",
     "late": "were older than max_age_ms before it",
@@ -235,6 +234,8 @@ def find_origins(
         arrived=origin_s[rows] * 1e3 / tick_ms,
         gaps=np.zeros(len(rows), int),
     )
+    # Without the other recordings, times of messages are whole ticks.
+    rounding_ms = tick_ms if refine is None else 0.0
     if refine is not None:
         messages = refine(recording, path, messages)
     rack, board = path.stations[-1 - len(path.boards)]
@@ -246,12 +247,12 @@ def find_origins(
         previous, at = (int(np.flatnonzero(messages.arrived == one)[0]) for one in (earlier, tick))
         gap_ms = (tick - messages.arrived[at - 1]) * tick_ms
         far_ms, link_ms = all_far_ms[at], all_link_ms[at]
-        if far_ms > path.far_ms + tick_ms:
+        if far_ms > path.far_ms + rounding_ms:
             yield (
                 f"in rack '{rack}' it took {far_ms:g} ms until '{board}' wrote;"
                 f" bound {path.far_ms:g} ms"
             )
-        if link_ms > path.link_ms + tick_ms:
+        if link_ms > path.link_ms + rounding_ms:
             yield (
                 f"the link took {link_ms:g} ms from '{rack}/{board}'; bound {path.link_ms:g} ms"
                 f" with adapter.lan.import.{path.port}.delay_ms"
@@ -259,7 +260,7 @@ def find_origins(
         for count, (_, text) in zip(messages.lost[at], LOSSES.items(), strict=True):
             if count:
                 yield f"{count} messages of '{rack}/{board}' {text}"
-        if gap_ms > path.exchange_ms + tick_ms and not messages.lost[at].any():
+        if gap_ms > path.exchange_ms + rounding_ms and not messages.lost[at].any():
             yield (
                 f"'{rack}/{board}' sent nothing new for {gap_ms:g} ms; it should every"
                 f" {path.exchange_ms:g} ms"
