@@ -8,7 +8,7 @@ simulated time, because each rack has its own ticks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -121,7 +121,7 @@ class JoinedPath:
     response_ms: float
     bound_eq_3_2_ms: float
     sum_eq_3_3_ms: float
-    before: JoinedPath | None = None
+    before: JoinedPath | None = field(default=None, kw_only=True)
 
     @property
     def boards(self) -> tuple[str, ...]:
@@ -228,8 +228,8 @@ class JoinedRacks:
             self.compute_response_ns(stations),
             *self.compute_bounds_ns(stations),
         )
-        path = JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns))
-        return replace(path, before=before)
+        times_ms = (ns * 1e-6 for ns in times_ns)
+        return JoinedPath(direction, stations, link.port, *times_ms, before=before)
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[RackLink] | None:
         """Return the links that information crosses on its way along `stations`.

@@ -30,6 +30,7 @@ from rack.tools.timing.measured_response import (
 
 MAX_CAUSES = 5
 """Largest number of different causes that the text lists for a path."""
+ROUNDING_MS = 1e-6
 MARKS = {True: "", False: "FAILS: ", None: "undecided: "}
 
 
@@ -69,14 +70,16 @@ def measure_joined_runs(recordings: Sequence[Recording]) -> list[Document]:
 
 def _describe_direction(direction: str, measured: Document) -> Document:
     """Return the responses in one direction with a verdict that allows for the uncertainty."""
-    times = measured["measured_ms"]
-    latest_ms = times["max"] + measured["uncertainty_ms"] if times else 0.0
     # Responses along parallel paths begin together. One of them stands for the others.
     beyond = {entry["tick"]: entry for entry in measured["beyond"]}
-    holds = measured["holds"]
-    if holds and latest_ms > measured["bound_ms"] + 1e-6:
-        holds = None
-    return {"direction": direction, **measured, "holds": holds, "beyond": [*beyond.values()]}
+    within_ms = measured["bound_ms"] - measured["uncertainty_ms"]
+    is_undecided = measured["holds"] and measured["measured_ms"]["max"] > within_ms + ROUNDING_MS
+    return {
+        "direction": direction,
+        **measured,
+        "holds": None if is_undecided else measured["holds"],
+        "beyond": [*beyond.values()],
+    }
 
 
 def _complete_messages(
