@@ -30,18 +30,21 @@ def load_partners(config: RackConfig) -> list[RackConfig]:
     return [load(name, overrides) for name in dict.fromkeys((*table.launch, *table.partners))]
 
 
-def join_racks(configs: Sequence[RackConfig]) -> JoinedRacks:
+def join_racks(
+    configs: Sequence[RackConfig], layouts: Mapping[str, Layout] | None = None
+) -> JoinedRacks:
     """Build the joint timing model of several racks.
 
     Args:
         configs: Valid configs of racks with different names.
+        layouts: Layouts of the racks. None to compute them, which imports the racks' levels.
 
     Raises:
         ConfigError: An import from one of these racks names a mailbox that the rack does not
             export.
     """
     members = {config.name: config for config in configs}
-    layouts = {name: resolve_layout(config) for name, config in members.items()}
+    layouts = layouts or {name: resolve_layout(config) for name, config in members.items()}
     timings = {name: build_rack_timing(members[name], layout) for name, layout in layouts.items()}
     return JoinedRacks(timings, layouts, tuple(_list_links(members, layouts)))
 
@@ -64,13 +67,15 @@ def _list_links(
                 why = f"rack '{entry.rack}' does not export this mailbox; its exports: {listed}"
                 raise ConfigError([Mistake(place, entry.source, why)])
             layout = layouts[name]
+            box = layout.find_mailbox(f"{LAN}.{port}")
             yield RackLink(
                 source=Station(entry.rack, layouts[entry.rack].find_mailbox(entry.mailbox).writer),
                 mailbox=entry.mailbox,
                 rack=name,
                 port=port,
-                readers=layout.find_mailbox(f"{LAN}.{port}").readers,
-                is_command=issubclass(entry.find_message_class(), Command),
+                readers=box.readers,
+                # Every command begins with the field of its base class.
+                is_command=box.fields[0].meaning == Command.message_type.fields[0].meaning,
                 exported=_compute_grid(layouts[entry.rack], exported[entry.mailbox].rate_hz),
                 imported=_compute_grid(layout, entry.rate_hz),
                 adapter_ns=layout.find_task(LAN).every * layout.clock_ns,

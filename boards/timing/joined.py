@@ -8,7 +8,7 @@ simulated time, because each rack has its own ticks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -108,6 +108,7 @@ class JoinedPath:
         response_ms: Longest response, including all waits.
         bound_eq_3_2_ms: Bound of eq. 3.2, where links count as levels.
         sum_eq_3_3_ms: Sum of eq. 3.3, likewise.
+        before: Path to the board that wrote the imported message, if it crosses a link.
     """
 
     direction: Literal["command", "status"]
@@ -120,6 +121,7 @@ class JoinedPath:
     response_ms: float
     bound_eq_3_2_ms: float
     sum_eq_3_3_ms: float
+    before: JoinedPath | None = field(default=None, kw_only=True)
 
     @property
     def boards(self) -> tuple[str, ...]:
@@ -172,25 +174,31 @@ class JoinedRacks:
         links = dict.fromkeys(link for way in ways for link in self.list_chain_links(way) or ())
         return tuple(link for link in links if link.delay_ns is None)
 
-    def list_paths(self, rack: str | None = None) -> list[JoinedPath]:
+    def list_paths(self, rack: str | None = None, *, is_whole: bool = False) -> list[JoinedPath]:
         """Return the predicted response of every chain, in each direction that information takes.
 
         Args:
             rack: Return only paths that end in this rack.
+            is_whole: Whether the runs of all racks measure it, not only that of the last one.
         """
         paths = [
-            self._build_path(direction, stations)
+            self._build_path(direction, stations, is_whole)
             for chain in self.chains
             for direction, stations in (("command", chain), ("status", chain[::-1]))
             if rack in (None, stations[-1].rack) and self.list_chain_links(stations)
         ]
         return list(dict.fromkeys(paths))
 
-    def _build_path(self, direction: Any, chain: tuple[Station, ...]) -> JoinedPath:
+    def _build_path(self, direction: Any, chain: tuple[Station, ...], is_whole: bool) -> JoinedPath:
         """Return the predicted response along the part of a chain whose response can be measured.
 
         It is measured from a release that the imported messages state. If they depend on messages
         of a third rack, they state the release of that rack's last board.
+
+        Args:
+            direction: "command" or "status".
+            chain: Boards in the direction of the information.
+            is_whole: Whether runs of the other racks are known, so that it continues there.
         """
         near = _find_beginning(chain)
         writer = chain[near - 1]
@@ -199,20 +207,29 @@ class JoinedRacks:
         boards = [station.board for station in chain[first:near]]
         row = find_mailbox_row(self.layouts[writer.rack], boards, [link.mailbox])
         start = near - len(row)
+        before = None
         if start == first and first > 0:
             start -= 1
+            if is_whole:
+                before = self._build_path(direction, chain[:near], is_whole)
+                start = near - len(before.stations)
         stations, far = chain[start:], chain[start:near]
         written = self.find_grid(writer)
-        taken_ns = link.compute_taken_ns(written, self.racks[chain[-1].rack].is_lockstep)
+        # A board may write a mailbox less often than it cycles.
+        box = self.layouts[writer.rack].find_mailbox(link.mailbox)
+        clock_ns = self.racks[writer.rack].clock_ns
+        published = TickGrid(box.every * clock_ns, box.phase * clock_ns)
+        taken_ns = link.compute_taken_ns(published, self.racks[chain[-1].rack].is_lockstep)
         times_ns = (
             self.find_grid(stations[0]).every,
-            max(link.exported.every, written.every),
+            max(link.exported.every, published.every),
             self.compute_response_ns(far) - written.every,
             written.every + taken_ns,
             self.compute_response_ns(stations),
             *self.compute_bounds_ns(stations),
         )
-        return JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns))
+        times_ms = (ns * 1e-6 for ns in times_ns)
+        return JoinedPath(direction, stations, link.port, *times_ms, before=before)
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[RackLink] | None:
         """Return the links that information crosses on its way along `stations`.

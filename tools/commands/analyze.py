@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from rack.tools.console.answer import print_json, write_json
-from rack.tools.console.parameters import Json, RunFolder, option
+from rack.tools.console.answer import Failure, print_json, write_json
+from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.progress import create_reading_progress
 from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
@@ -16,7 +16,9 @@ from rack.tools.timing.operator_response import show_response
 
 
 def analyze(
-    run: RunFolder,
+    runs: list[Path] = argument(
+        "RUN...", "folder of a run, as in runs/nasrem-20250101-120000; or one of each rack"
+    ),
     percentile: float = option(
         "--percentile P",
         "judge by the longest of P in 100 cycles, as in 99.9; by default of all, as in eq. 3.6",
@@ -43,13 +45,27 @@ def analyze(
     --verbose adds all levels, tasks and equations. The command writes analysis.json.
     `rack gantt RUN` shows when each task had its core.
 
-    Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
+    With the runs of several racks that exchanged messages, the command instead measures the
+    responses across these racks. It follows each message through all of them, and compares the
+    longest response along each path with its bound (`rack check` with several configs). It shows
+    where the longest response spent its time, and why bounds were exceeded: lost messages, a delay
+    beyond delay_ms, or late cycles and boards, by rack. In real time a bound counts as exceeded if
+    it is exceeded by more than the uncertainty of the clock comparison.
+
+    Exit status: 0 every equation or bound held; 1 one failed; 2 the runs cannot be analyzed.
 
     \b
     Examples:
       rack analyze runs/nasrem-20250101-120000
       rack analyze runs/nasrem-20250101-120000 --percentile 99.9
+      rack analyze runs/brown-20250101-120000 runs/brown-servo-20250101-120001
     """
+    run, *others = runs
+    if others:
+        if response or verbose or out is not None or percentile < 100.0:
+            raise Failure("--percentile, --response, --out and --verbose take one RUN", 2)
+        _analyze_racks([Recording(each) for each in runs], as_json)
+        return
     folder = run if out is None else out
     if response:
         if not show_response(Recording(run), folder, as_json):
@@ -66,4 +82,18 @@ def analyze(
     else:
         print_blocks((*format_analysis(analysis, verbose), "", f"{folder}/analysis.json"))
     if not analysis.is_fulfilled:
+        sys.exit(1)
+
+
+def _analyze_racks(recordings: list[Recording], as_json: bool) -> None:
+    """Print the responses across racks. Exit with status 1 if a bound is exceeded."""
+    # Import late, because most runs are analyzed alone.
+    from rack.tools.timing.joined_runs import format_joined_runs, measure_joined_runs
+
+    across = measure_joined_runs(recordings)
+    if as_json:
+        print_json({"racks": [each.layout.rack for each in recordings], "across": across})
+    else:
+        print_blocks(format_joined_runs(across))
+    if any(one["holds"] is False for one in across):
         sys.exit(1)

@@ -30,6 +30,8 @@ DROPPED = (
     *("count", "took_ms", "started_ms"),
 )
 """Columns that a narrow terminal leaves out, in this order."""
+NOT_TABULATED = "levels", "beyond", "count", "parts", "uncertainty_ms"
+"""Keys of a measured response that have no column."""
 CHANGED_RATIO = 1.05
 """Ratio of a core's highest to its lowest frequency above which the text mentions the core."""
 
@@ -182,7 +184,7 @@ def _format_responses(chains: Sequence[Document]) -> Blocks:
             if levels := chain[direction]["levels"]:
                 way = {"way": f"{direction}, {levels[0]} to {levels[-1]}"}
                 bounds = {key: chain[key] for key in ("bound_eq_3_2_ms", "sum_eq_3_3_ms")}
-                rows.append(way | chain[direction] | bounds | {"levels": None, "beyond": None})
+                rows.append(way | chain[direction] | bounds | dict.fromkeys(NOT_TABULATED))
                 beyond += [way | slow for slow in chain[direction]["beyond"]]
     yield from _format_section("System response, ms of simulated time", rows)
     beyond.sort(key=lambda slow: -slow["ms"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,12 +27,18 @@ class Origins(NamedTuple):
         list_delays: Yields a text for each cause of delay on the way to this rack. Its arguments
             are two successive values of `arrived`; the response ends with the message of the
             second.
+        parts: Times in ms on the way to this rack, for each message, by rack and link.
+        uncertainty_ms: Largest error of `arrived`, or 0 if it is never late.
+        gaps: Number of messages before each whose origin is not recorded.
     """
 
     basis: np.ndarray
     arrived: np.ndarray
     first_ticks: float
     list_delays: Callable[[float, float], Iterator[str]]
+    parts: Mapping[str, np.ndarray]
+    uncertainty_ms: float
+    gaps: np.ndarray
 
 
 class BoardChain(NamedTuple):
@@ -47,6 +53,24 @@ class BoardChain(NamedTuple):
     boards: Sequence[str]
     boxes: Sequence[MailboxSpec]
     origins: Origins | None = None
+
+
+class ChainResponses(NamedTuple):
+    """Responses along one chain.
+
+    Attributes:
+        times_ms: The responses, shape (n,).
+        beyond: Entries for those that exceed the bound.
+        unseen: Number of responses that could not be measured.
+        parts: Times of the longest response in ms, by rack and link. Empty within one rack.
+        uncertainty_ms: Largest error of the responses.
+    """
+
+    times_ms: np.ndarray
+    beyond: list[Document]
+    unseen: int
+    parts: dict[str, float]
+    uncertainty_ms: float
 
 
 def measure_direction(
@@ -66,29 +90,27 @@ def measure_direction(
         for chain in chains
         if recorded.issuperset(box.name for box in chain.boxes)
     ]
-    responses_ms = np.concatenate([np.zeros(0), *(ms for ms, _, _ in measured)])
-    beyond = [excess for _, excesses, _ in measured for excess in excesses]
+    responses_ms = np.concatenate([np.zeros(0), *(each.times_ms for each in measured)])
+    beyond = [excess for each in measured for excess in each.beyond]
+    longest = max(measured, key=lambda each: each.times_ms.max(initial=0.0), default=None)
     return {
         "levels": list(levels),
         "measured_ms": compute_distribution(responses_ms),
         "bound_ms": bound_ms,
         "holds": not beyond if len(responses_ms) else None,
         "beyond": beyond,
-        "unseen": sum(unseen for _, _, unseen in measured),
+        "unseen": sum(each.unseen for each in measured),
+        "count": len(longest.times_ms) if longest else 0,
+        "uncertainty_ms": longest.uncertainty_ms if longest else 0.0,
+        "parts": longest.parts if longest else {},
     }
 
 
-def _measure_chain(
-    recording: Recording, chain: BoardChain, bound_ms: float
-) -> tuple[np.ndarray, list[Document], int]:
+def _measure_chain(recording: Recording, chain: BoardChain, bound_ms: float) -> ChainResponses:
     """Measure the responses along one chain.
 
     The worst case is information that arrives just after a release whose message passed the whole
     chain. It has to wait for the next such release.
-
-    Returns:
-        The measured responses in ms, entries for those that exceed the bound, and the number of
-        responses that could not be measured.
     """
     boards, boxes, origins = chain
     layout = recording.layout
@@ -108,7 +130,8 @@ def _measure_chain(
         # Without the status of the adapter, the origin of a message is unknown.
         is_known = np.isin(arrived, origins.basis)
         arrived, at = arrived[is_known], at[is_known]
-        arrived = origins.arrived[np.searchsorted(origins.basis, arrived)]
+        messages = np.searchsorted(origins.basis, arrived)
+        arrived = origins.arrived[messages]
         first = origins.first_ticks
     visible = visible_at[at[1:]]
     read = layout.find_read_grid(boxes[-1], boards[-1])
@@ -119,19 +142,32 @@ def _measure_chain(
         # The first message with the information may be among the unrecorded ones.
         gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
         is_seen = gaps[at[1:]] == gaps[at[:-1]]
+    uncertainty_ms = origins.uncertainty_ms if origins else 0.0
+    limit_ms = bound_ms + uncertainty_ms + tick_ms / 2
+    parts: dict[str, float] = {}
+    if origins is not None:
+        is_seen &= np.diff(origins.gaps[messages]) == 0
+        if is_seen.any():
+            longest = int((ms * is_seen).argmax())
+            wait = arrived[longest + 1] - arrived[longest] - first
+            parts = {name: times[messages[longest + 1]] for name, times in origins.parts.items()}
+            parts = {"waiting for new information": wait * tick_ms, **parts}
+            parts[layout.rack] = ms[longest] - sum(parts.values())
+            parts = {name: round(float(part_ms), 6) for name, part_ms in parts.items()}
     beyond = [
         {
             "tick": int(arrived[k]),
             "ms": round(float(ms[k]), 6),
-            "delayed_by": [*_list_delays(recording, boards, int(arrived[k]), int(acts[k]))],
+            "delayed_by": [*list_delays(recording, boards, int(arrived[k]), int(acts[k]))],
             "network": [] if origins is None else [*origins.list_delays(*arrived[k : k + 2])],
         }
-        for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
+        for k in np.flatnonzero(is_seen & (ms > limit_ms))
     ]
-    return ms[is_seen], beyond, int(np.count_nonzero(~is_seen))
+    unseen = int(np.count_nonzero(~is_seen))
+    return ChainResponses(ms[is_seen], beyond, unseen, parts, uncertainty_ms)
 
 
-def _list_delays(
+def list_delays(
     recording: Recording, levels: Sequence[str], since: int, until: int
 ) -> Iterator[str]:
     """Yield a text for each cause of delay between two ticks.
@@ -170,5 +206,8 @@ NOT_MEASURED: Document = {
     "holds": None,
     "beyond": [],
     "unseen": 0,
+    "count": 0,
+    "uncertainty_ms": 0.0,
+    "parts": {},
 }
 """Response in a direction that is not measured along these boards."""

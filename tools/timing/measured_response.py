@@ -12,7 +12,8 @@ the uncertainty of the clock comparison, so no response is measured too short.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,54 @@ from rack.tools.monitor.network import ADAPTER, STATUS, read_entries
 from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.chain_response import NOT_MEASURED, BoardChain, Origins, measure_direction
+
+LOSSES = {
+    "missing": "were lost before it",
+    "late": "were older than max_age_ms before it",
+    "superseded": "arrived no earlier than it",
+}
+"""Counts of an import whose messages did not get through, and how they got lost."""
+
+
+class ImportedMessages(NamedTuple):
+    """Imported messages on a path across racks, in ascending order of `basis`.
+
+    Times are in ticks of the importing rack, and in fractions of them.
+
+    Attributes:
+        basis: When they were written, as this rack knew it.
+        taken: When this rack took them.
+        serials: Their serials in the exported mailbox.
+        lost: Number of messages that did not get through since the one before, by `LOSSES`,
+            shape (n, 3).
+        written: When they were written.
+        arrived: When their oldest information arrived at the first board.
+        gaps: Number of messages before each that are left out because nothing is known of them.
+        parts: Known parts of the time from `arrived` to `written`, ms, by rack and link.
+        uncertainty_ms: Largest error of `arrived`, or 0 if it is never late.
+        list_delays: Yields a text for each cause of delay in other racks between two messages,
+            given by their indices.
+    """
+
+    basis: np.ndarray
+    taken: np.ndarray
+    serials: np.ndarray
+    lost: np.ndarray
+    written: np.ndarray
+    arrived: np.ndarray
+    gaps: np.ndarray
+    parts: Mapping[str, np.ndarray] = {}
+    uncertainty_ms: float = 0.0
+    list_delays: Callable[[int, int], Iterator[str]] = lambda _previous, _at: iter(())
+
+    def select(self, which: np.ndarray) -> ImportedMessages:
+        """Return the messages for which `which` is True, as this rack knew them."""
+        gaps = self.gaps + np.cumsum(~which)
+        return ImportedMessages(*(column[which] for column in (*self[:6], gaps)))
+
+
+Refinement = Callable[[Recording, JoinedPath, ImportedMessages], ImportedMessages]
+"""Completes the messages that a recording shows on a path."""
 
 
 def measure_system_response(recording: Recording) -> Document | None:
@@ -50,7 +99,7 @@ def measure_system_response(recording: Recording) -> Document | None:
         _measure_response(recording, rack, chains)
         for chains in sorted(rack.chain_groups, key=lambda chains: chains != rack.hierarchy)
     ]
-    documents += _measure_joined_responses(recording, paths or ())
+    documents += measure_joined_responses(recording, paths or ())
     if not documents:
         return None
     # Without measurements, a response needs no place beside others.
@@ -108,8 +157,8 @@ def _measure_direction(
     return measure_direction(recording, levels[start:], bound_ms, measured)
 
 
-def _measure_joined_responses(
-    recording: Recording, paths: Sequence[JoinedPath]
+def measure_joined_responses(
+    recording: Recording, paths: Sequence[JoinedPath], refine: Refinement | None = None
 ) -> Iterator[Document]:
     """Yield the response along each group of parallel paths from another rack as plain data.
 
@@ -117,6 +166,11 @@ def _measure_joined_responses(
     boards of the same levels. An entry has the form of the response along the chains of one rack,
     with only one direction. Paths are left out if their messages do not carry the origin of the
     information to the last board.
+
+    Args:
+        recording: Recording of the last rack.
+        paths: The paths.
+        refine: As for `find_origins`.
     """
     groups: dict[object, list[JoinedPath]] = {}
     for path in paths:
@@ -126,13 +180,13 @@ def _measure_joined_responses(
     for group in groups.values():
         boxes = [find_path_mailboxes(recording.layout, (ADAPTER, *each.boards)) for each in group]
         chains = [
-            BoardChain((ADAPTER, *each.boards), row, _find_origins(recording, each))
+            BoardChain((ADAPTER, *each.boards), row, find_origins(recording, each, refine))
             for each, row in zip(group, boxes, strict=True)
             if len(row) == len(each.boards)
             and row[0].name == f"{ADAPTER}.{each.port}"
             and {STATUS, *(box.name for box in row)} <= {*recording.mailboxes}
         ]
-        if not chains:
+        if not chains and refine is None:
             continue
         path = group[0]
         levels = [*format_joined_levels([each.stations for each in group])]
@@ -148,43 +202,81 @@ def _measure_joined_responses(
         }
 
 
-def _find_origins(recording: Recording, path: JoinedPath) -> Origins:
-    """Return when the information in the imported messages of a path arrived at its first board."""
+def find_origins(
+    recording: Recording, path: JoinedPath, refine: Refinement | None = None
+) -> Origins:
+    """Return when the information in the imported messages of a path arrived at its first board.
+
+    Args:
+        recording: Recording of the last rack.
+        path: The path.
+        refine: Completes what this recording shows by what others show.
+    """
     entry = f"import_{path.port}"
-    ticks, ages, origin_s, lost = (
+    ticks, ages, origin_s, serials, *counts = (
         recording.read_signal(STATUS, field)
-        for field in ("tick", f"{entry}.age", f"{entry}.origin_s", f"{entry}.missing")
+        for field in (
+            "tick",
+            *(f"{entry}.{name}" for name in ("age", "origin_s", "serial", *LOSSES)),
+        )
     )
     basis = np.maximum(ticks - ages, 0)
     # The first status with a message belongs to the cycle that took it over.
-    taken = np.flatnonzero((ages >= 0) & (np.diff(basis, prepend=-1) != 0))
+    rows = np.flatnonzero((ages >= 0) & (np.diff(basis, prepend=-1) != 0))
+    rows = rows[np.argsort(basis[rows], kind="stable")]
     tick_ms = recording.layout.clock_ns * 1e-6
-    arrived = origin_s * 1e3 / tick_ms
+    messages = ImportedMessages(
+        basis=basis[rows],
+        taken=ticks[rows],
+        serials=serials[rows],
+        lost=np.diff(np.stack(counts, 1)[rows], axis=0, prepend=0),
+        written=basis[rows],
+        arrived=origin_s[rows] * 1e3 / tick_ms,
+        gaps=np.zeros(len(rows), int),
+    )
+    # Without the other recordings, times of messages are whole ticks.
+    rounding_ms = tick_ms if refine is None else 0.0
+    if refine is not None:
+        messages = refine(recording, path, messages)
     rack, board = path.stations[-1 - len(path.boards)]
+    all_far_ms = (messages.written - messages.arrived) * tick_ms
+    all_link_ms = (messages.taken - messages.written) * tick_ms
 
     def list_delays(earlier: float, tick: float) -> Iterator[str]:
         """Yield a text for each cause of delay before the message with this origin was taken."""
-        row = taken[np.flatnonzero(arrived[taken] == tick)[0]]
-        gap_ms = (tick - earlier) * tick_ms
-        far_ms = (basis[row] - arrived[row]) * tick_ms
-        link_ms = (ticks[row] - basis[row]) * tick_ms
-        if far_ms > path.far_ms + tick_ms:
+        previous, at = (int(np.flatnonzero(messages.arrived == one)[0]) for one in (earlier, tick))
+        gap_ms = (tick - messages.arrived[at - 1]) * tick_ms
+        far_ms, link_ms = all_far_ms[at], all_link_ms[at]
+        if far_ms > path.far_ms + rounding_ms:
             yield (
                 f"in rack '{rack}' it took {far_ms:g} ms until '{board}' wrote;"
                 f" bound {path.far_ms:g} ms"
             )
-        if link_ms > path.link_ms + tick_ms:
+        if link_ms > path.link_ms + rounding_ms:
             yield (
                 f"the link took {link_ms:g} ms from '{rack}/{board}'; bound {path.link_ms:g} ms"
                 f" with adapter.lan.import.{path.port}.delay_ms"
             )
-        if missing := int(lost[row] - lost[max(row - 1, 0)]):
-            yield f"{missing} messages of '{rack}/{board}' were lost before it"
-        elif gap_ms > path.exchange_ms + tick_ms:
+        for count, (_, text) in zip(messages.lost[at], LOSSES.items(), strict=True):
+            if count:
+                yield f"{count} messages of '{rack}/{board}' {text}"
+        if gap_ms > path.exchange_ms + rounding_ms and not messages.lost[at].any():
             yield (
                 f"'{rack}/{board}' sent nothing new for {gap_ms:g} ms; it should every"
                 f" {path.exchange_ms:g} ms"
             )
+        yield from messages.list_delays(previous, at)
 
-    order = taken[np.argsort(basis[taken], kind="stable")]
-    return Origins(basis[order], arrived[order], path.first_cycle_ms / tick_ms, list_delays)
+    return Origins(
+        messages.basis,
+        messages.arrived,
+        path.first_cycle_ms / tick_ms,
+        list_delays,
+        {
+            **messages.parts,
+            rack: all_far_ms - sum(messages.parts.values()),
+            f"link {path.port}": all_link_ms,
+        },
+        messages.uncertainty_ms,
+        messages.gaps,
+    )

@@ -194,7 +194,11 @@ def equation(name: str, holds: bool, mostly: bool) -> NasremRun:
 def response(delay: str) -> NasremRun:
     """Return a run in which commands took 6 ms instead of the 4 ms of equation 3.3, one of them
     beyond the grid, delayed by this."""
-    way = {"measured_ms": {"max": 6.0}, "bound_ms": 5.0, "beyond": [{"delayed_by": [delay]}]}
+    way = {
+        "measured_ms": {"max": 6.0},
+        "bound_ms": 5.0,
+        "beyond": [{"delayed_by": [delay], "network": []}],
+    }
     found = {"command": way, "status": {"measured_ms": None, "bound_ms": 5.0, "beyond": []}}
     late = parse_response({**found, "sum_eq_3_3_ms": 4.0, "crosses_racks": False})
     assert late is not None

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from rack.tools.launch.launch import RunResult
 from rack.tools.monitor.host_side import list_entries
 from rack.tools.recording.history import list_fired_rows
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import RackGrid
+from rack.tools.timing.joined_runs import measure_joined_runs
 from rack.tools.timing.measured_response import measure_system_response
 
 TASKS_S = {
@@ -109,7 +110,7 @@ def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
 
 def _parse_direction(direction: Mapping[str, Any]) -> WayResponse:
     """Return the response in one direction from its entry in a report."""
-    delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
+    delays = [(*beyond["delayed_by"], *beyond["network"]) for beyond in direction["beyond"]]
     times = direction["measured_ms"]
     return WayResponse(
         longest_ms=None if times is None else times["max"],
@@ -147,8 +148,7 @@ class NetworkRun(TaskRun):
 
     Attributes:
         servo_missed: Fraction of the servo rack's cycles that were missed or skipped.
-        response_ms: Time from the request for a modification by the machine above until a servo law
-            is modified, ms. None if it never was.
+        response_ms: Median response of a command of the machine above, ms. None if it sent none.
     """
 
     servo_missed: float
@@ -259,17 +259,24 @@ def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
         result, general, servo = _record_two_racks(later_ms, workshop, attempt)
         lost = [each.layout.rack for each in (general, servo) if each.lost_rows]
         if not lost:
-            response_ms = _compute_response_ms(general, servo)
             holding = servo.read_signal("supervisor.status", "holding")
+            reasons = servo.read_signal("shoulder.status", "reason")
             # The joints hold without fresh references of the other rack.
             found = {
-                "modifications_unanswered": float(response_ms is None),
+                "modifications_unanswered": float(
+                    not any(MODIFICATION in str(text) for text in reasons)
+                ),
                 "references_lacking_share": holding.mean() if len(holding) else 1.0,
             }
+            across = sorted(measure_joined_runs([general, servo]), key=itemgetter("bound_ms"))
+            longest = {one["direction"]: one for one in across if one["count"]}
+            ways = {way: _parse_direction(one) for way, one in longest.items()}
+            run = summarize_task(result, general, servo)
+            response = run.response and replace(run.response, ways=ways)
             return NetworkRun(
-                **vars(summarize_task(result, general, servo)) | {"mechanism": found},
+                **vars(run) | {"mechanism": found, "response": response},
                 servo_missed=_compute_missed_share(servo),
-                response_ms=response_ms,
+                response_ms=longest["command"]["measured_ms"]["p50"] if "command" in ways else None,
             )
     raise Failure(f"{' and '.join(lost)} lost records in each of {MAX_ATTEMPTS} runs")
 
@@ -312,32 +319,6 @@ def _load_renamed(workshop: Workshop, name: str, settings: Sequence[str]) -> Rac
     """Load one of the two racks with settings, and give unique names to both in its config."""
     text = load(workshop.find_source(name), [*settings, *UNVIEWED_SETTINGS]).to_toml_text()
     return load_text(re.sub(f'(?<=["_]){BROWN}(?=["/-])|(?<=unix/){BROWN}', workshop.rack, text))
-
-
-def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
-    """Return the time, in ms, from the first request for a modification to its report.
-
-    None if either message is missing.
-    """
-    begin_ns = _find_modification_ns(general, "modifications.command", "wanted")
-    end_ns = _find_modification_ns(servo, "shoulder.status", "reason")
-    return None if begin_ns is None or end_ns is None else 1e-6 * (end_ns - begin_ns)
-
-
-def _find_modification_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return when the first message whose `field` contains `MODIFICATION` became visible, in ns.
-
-    `box` is the mailbox of the messages. The time is on CLOCK_MONOTONIC, or simulated time in
-    lockstep. None if there is no such message.
-    """
-    is_named = [MODIFICATION in str(text) for text in recording.read_signal(box, field)]
-    ticks = recording.read_signal(box, "visible_at")[is_named]
-    if not len(ticks):
-        return None
-    grid = RackGrid(recording)
-    if grid.is_lockstep:
-        return int(ticks[0]) * grid.clock_ns
-    return int(grid.convert_ticks(ticks[:1])[0])
 
 
 def _build_network_experiment(later_ms: int, about: str) -> Experiment[NetworkRun]:
