@@ -191,7 +191,7 @@ class Block:
     FINISH = 31
     SCHEDULER = 32  # Scheduler of an executor, 0 if the rack's config names none
     # In lockstep, processor time in ns of the cycle that waits for the end of its job on a
-    # simulated core.
+    # simulated core. Then the end of the job.
     COMPUTING_NS = 33
     # Of a task with standbys, written by the copy that takes over: see `rack.backplane.standby`.
     # Number of the active copy, 0 for the task itself.
@@ -212,6 +212,7 @@ class Block:
     # Of a task with standbys: 1 + number of the copy that has strayed, 0 for none. Written by the
     # copy that has found it, and cleared by the clock.
     STRAYED = 45
+    BEGUN_NS = 46  # begin of that job, in simulated ns since tick 0, like its end in COMPUTING_NS
 
 
 class TaskState(IntEnum):

@@ -24,7 +24,11 @@ from rack.boards.config.layout import RETAINED_S, LayoutBuilder, build_exchanges
 from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
-from rack.boards.config.schedulers import build_scheduling, compute_clock_reservation
+from rack.boards.config.schedulers import (
+    build_clock_scheduling,
+    build_scheduling,
+    compute_clock_reservation,
+)
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.sending import settle_sending
 from rack.boards.config.timing import is_critical
@@ -163,7 +167,10 @@ class Resolved:
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
-            schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
+            schedulings={
+                **{t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
+                **build_clock_scheduling(config),
+            },
             copy=None if clock.standby is None else 0,
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
@@ -336,9 +343,7 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            scheduling=(
-                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
-            ),
+            scheduling=build_scheduling(self._config, ports.place, spec.every, is_locked=is_locked),
             compares=is_executor and board.compare,
             votes=is_executor and board.vote,
             budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),

@@ -465,6 +465,16 @@ class RackConfig(Table):
         return self.clock.mode == "lockstep"
 
     @property
+    def simulated_load(self) -> float:
+        """Multiple of its budget that a cycle takes on a simulated core. 0 without such cores."""
+        return self.timing.lockstep_load if self.is_lockstep else 0.0
+
+    @property
+    def takes_time(self) -> bool:
+        """Whether computing takes time: in real time, and in lockstep on simulated cores."""
+        return not self.is_lockstep or self.simulated_load > 0
+
+    @property
     def clock_ns(self) -> int:
         """Length of a tick in ns of simulated time."""
         return round(self.clock.period_ms * 1e6)

@@ -117,7 +117,7 @@ def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
             f" {', '.join(rack.inboxes)}"
         )
     known = [board for board in rack.boards.values() if board.budget is not None]
-    if known and rack.is_lockstep:
+    if known and not rack.takes_time:
         yield (
             "in lockstep a tick waits for late tasks; these are the times of the same rack in real"
             " time"

@@ -215,7 +215,7 @@ def _judge_tasks(
 ) -> Iterator[EquationVerdict]:
     """Yield verdicts on eq. 3.7 for executors, and on the response times of all tasks.
 
-    Response times are evaluated only for runs in real time.
+    Response times are evaluated only if computing takes time.
     """
     for name, cycles in cycles_by_task.items():
         rows = cycles.rows
@@ -226,7 +226,7 @@ def _judge_tasks(
             steps_ns = (1 + trace_times.count_skipped_releases(rows)) * every_ns
             step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
-        if not rack.is_lockstep:
+        if rack.takes_time:
             deadline_ns = compute_due_ns(rack, cycles.task)
             response_ns = trace_times.compute_response_ns(rows)
             worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)

@@ -109,7 +109,7 @@ def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
             cycles.task,
             rows,
             rack.tick_ns,
-            rack.is_lockstep,
+            rack.takes_time,
             stretches=cycles.stretches[judged],
             due_ns=compute_due_ns(rack, cycles.task),
             parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
@@ -145,7 +145,7 @@ def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
         name: build_task_document(cycles, analysis.predicted)
         for name, cycles in analysis.cycles.items()
     }
-    yield build_times_table(tasks, analysis.predicted.is_lockstep)
+    yield build_times_table(tasks, analysis.predicted.takes_time)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
     yield build_verdict_table(
         (side, verdict)
@@ -187,7 +187,10 @@ def _format_summary(analysis: Analysis) -> Iterator[str]:
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
-        yield "lockstep: no deadlines, no lateness; processor times are real"
+        has_none = (
+            "simulated cores" if analysis.predicted.takes_time else "no deadlines, no lateness"
+        )
+        yield f"lockstep: {has_none}; processor times are real"
     if restarted := list_restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
     yield from _list_unjudged(analysis)
