@@ -114,6 +114,7 @@ class System:
     # Number of snapshots held by the crate, of this rack or of earlier ones. Written by the crate.
     SNAPSHOTS = 61
     SNAPSHOT_BYTES = 62  # memory used by the snapshots alone, written by the crate
+    EXCLUSIVE_CORES = 63  # 1 if the rack has its cores to itself, written by the Rack
     SYSFAIL = 64  # one word for each of 22 slots: 1 until the board's self-test has passed
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, cast
 
 from rack.backplane.address_map import CLOCK_STANDBY
@@ -146,7 +147,7 @@ class Resolved:
             writer = self.layout.find_mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.find_task(writer).every)
         executors = [task for task in self.layout.tasks if task.role == "executor"]
-        core = find_core(clock.core)
+        core = self.clock_cores[0]
         # In lockstep the clock shares the core of the fastest board, because a context switch is
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
@@ -186,8 +187,18 @@ class Resolved:
         if standby is None:
             return {}
         priority = wiring.priority if standby.priority is None else standby.priority
-        core = find_core(standby.core)
+        core = self.clock_cores[1]
         return {CLOCK_STANDBY: replace(wiring, core=core, priority=priority, copy=1)}
+
+    @cached_property
+    def clock_cores(self) -> tuple[int, ...]:
+        """Cores of the clock and of its standby.
+
+        They are found once, because cores that the rack gets to itself are no longer available to
+        this process.
+        """
+        places = self.config.clock, self.config.clock.standby
+        return tuple(find_core(place.core) for place in places if place is not None)
 
     def _to_ticks(self, seconds: float) -> int:
         """Convert simulated time in s to ticks."""

@@ -46,7 +46,6 @@ def build_rack_timing(
     schedule = None if config.schedule is None else compute_frames(config.schedule, config.clock_ns)
     return RackTiming(
         is_lockstep=config.is_lockstep,
-        takes_time=config.takes_time,
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
         clock=TimedTask(

@@ -31,7 +31,6 @@ class RackTiming:
 
     Attributes:
         is_lockstep: Whether the clock runs in lockstep.
-        takes_time: Whether computing takes time: in real time, and in lockstep on simulated cores.
         speed: Simulated time divided by real time. It changes cycles, but not budgets, which are
             processor times.
         clock_ns: Length of a tick in ns of simulated time.
@@ -46,7 +45,6 @@ class RackTiming:
     """
 
     is_lockstep: bool
-    takes_time: bool
     speed: float
     clock_ns: int
     clock: TimedTask
