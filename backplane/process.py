@@ -171,7 +171,7 @@ def reserve_time(reservation: Reservation, pid: int = 0) -> str:
 
 PERMITS_RESERVATIONS = (
     "time on one core is reserved only as root, with kernel.sched_rt_runtime_us = -1 or in an"
-    " exclusive cpuset"
+    " exclusive cpuset (clock.exclusive_cores)"
 )
 """Advice on obtaining reservations."""
 

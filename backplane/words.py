@@ -114,6 +114,7 @@ class System:
     # Number of snapshots held by the crate, of this rack or of earlier ones. Written by the crate.
     SNAPSHOTS = 61
     SNAPSHOT_BYTES = 62  # memory used by the snapshots alone, written by the crate
+    EXCLUSIVE_CORES = 63  # 1 if the rack has its cores to itself, written by the Rack
     SYSFAIL = 64  # one word for each of 22 slots: 1 until the board's self-test has passed
 
 
@@ -191,7 +192,7 @@ class Block:
     FINISH = 31
     SCHEDULER = 32  # Scheduler of an executor, 0 if the rack's config names none
     # In lockstep, processor time in ns of the cycle that waits for the end of its job on a
-    # simulated core.
+    # simulated core. Then the end of the job.
     COMPUTING_NS = 33
     # Of a task with standbys, written by the copy that takes over: see `rack.backplane.standby`.
     # Number of the active copy, 0 for the task itself.
@@ -212,6 +213,7 @@ class Block:
     # Of a task with standbys: 1 + number of the copy that has strayed, 0 for none. Written by the
     # copy that has found it, and cleared by the clock.
     STRAYED = 45
+    BEGUN_NS = 46  # begin of that job, in simulated ns since tick 0, like its end in COMPUTING_NS
 
 
 class TaskState(IntEnum):

@@ -87,22 +87,30 @@ class Continuation:
 
 @dataclass(frozen=True)
 class Scheduling:
-    """Scheduler of a board's executor, and what it needs.
+    """Scheduler of a task or the clock, and what it needs.
 
     Attributes:
         core: The core that the config requests.
+        priority: The fixed priority that the config requests.
         scheduler: Its scheduler at the launch.
         is_critical: Whether maximum urgency first runs it before others.
-        cost_ns: In lockstep, simulated processor time of a cycle. 0 if it takes none.
+        cost_ns: In lockstep, simulated processor time of a cycle or plan. 0 if it takes none.
+        switch_ns: Simulated time of the two context switches of a cycle or plan.
+        locked_ns: Part of `cost_ns`, at its end, which runs at priority `ceiling`.
+        ceiling: Priority of the executor that must wait for a plan update. 0 if none must.
         reservation: In real time, processor time to reserve under earliest deadline first. None
             without a budget.
         clocks: The same of the clock if it is on this core.
     """
 
     core: int
+    priority: int
     scheduler: Scheduler
     is_critical: bool
     cost_ns: int
+    switch_ns: int
+    locked_ns: int
+    ceiling: int
     reservation: Reservation | None
     clocks: Reservation | None
 
@@ -196,8 +204,8 @@ class ClockWiring:
         restart_ticks: In lockstep, time from the loss of a board until it rejoins.
         on_loss: Stop required of the arm while a task is lost, keyed by task.
         reservation: Processor time to reserve instead of a priority, None for none.
-        schedulings: How executors compete for their cores, by task. Empty if the config names no
-            scheduler.
+        schedulings: How tasks compete for their cores, by task. Empty if the config names no
+            scheduler. On simulated cores also planners and the clock.
         copy: Number of this process among those that can run the clock, None if it is the only one.
     """
 

@@ -86,8 +86,13 @@ MISTAKES = {
     ),
     "load of a planner": (
         "nasrem",
-        (LOAD, "clock.mode=lockstep"),
-        "timing.lockstep_load = 1.0: 'task' has a planner, which would take no simulated time",
+        (
+            LOAD,
+            "clock.mode=lockstep",
+            "clock.scheduler=fixed-priority",
+            *(f"board.task.budget.{part}_ms=0" for part in ("plan", "update")),
+        ),
+        "board.task.budget.plan_ms: missing; a plan takes this time, times timing.lockstep_load",
     ),
     "load without a budget": (
         "chimera",
@@ -201,9 +206,7 @@ def predict_late(*settings: str) -> set[str]:
     return {response.task for response in timing.responses if not response.holds}
 
 
-FREE = ("timing.context_switch_ms=0", "timing.clock_ms=0.001")
-"""In lockstep, neither context switches nor the clock take simulated time."""
-LIGHTER = tuple(f"board.world.budget.process_ms={ms}" for ms in (5.2, 4.4, 4.0))
+LIGHTER = tuple(f"board.world.budget.process_ms={ms}" for ms in (3.5, 2.4, 1.6))
 
 
 @pytest.mark.slow
@@ -213,16 +216,16 @@ def test_the_check_predicts_which_boards_are_late_under_each_scheduler(
 ) -> None:
     found = []
     for scheduler in ("clock.scheduler=fixed-priority", EARLIEST, URGENCY):
-        ran = run_overload(rack_name, scheduler, world, *FREE)
+        ran = run_overload(rack_name, scheduler, world)
         late = {board for board, missed in ran.missed.items() if missed}
-        predicted = predict_late(scheduler, world, *FREE)
+        predicted = predict_late(scheduler, world)
         assert late <= predicted, scheduler
         assert bool(late) == bool(predicted), scheduler
         found.append(late)
     assert [len(late) for late in found] == {
-        "5.2": [2, 5, 2],
-        "4.4": [0, 0, 1],
-        "4.0": [0, 0, 0],
+        "3.5": [2, 5, 2],
+        "2.4": [0, 0, 1],
+        "1.6": [0, 0, 0],
     }[world[-3:]]
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, cast
 
 from rack.backplane.address_map import CLOCK_STANDBY
@@ -24,7 +25,11 @@ from rack.boards.config.layout import RETAINED_S, LayoutBuilder, build_exchanges
 from rack.boards.config.published import PublishedRack, gather_facts
 from rack.boards.config.rules import apply_rules, load_network_rules
 from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
-from rack.boards.config.schedulers import build_scheduling, compute_clock_reservation
+from rack.boards.config.schedulers import (
+    build_clock_scheduling,
+    build_scheduling,
+    compute_clock_reservation,
+)
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.sending import settle_sending
 from rack.boards.config.timing import is_critical
@@ -142,7 +147,7 @@ class Resolved:
             writer = self.layout.find_mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.find_task(writer).every)
         executors = [task for task in self.layout.tasks if task.role == "executor"]
-        core = find_core(clock.core)
+        core = self.clock_cores[0]
         # In lockstep the clock shares the core of the fastest board, because a context switch is
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
@@ -163,7 +168,10 @@ class Resolved:
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
-            schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
+            schedulings={
+                **{t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
+                **build_clock_scheduling(config),
+            },
             copy=None if clock.standby is None else 0,
             restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
@@ -179,8 +187,18 @@ class Resolved:
         if standby is None:
             return {}
         priority = wiring.priority if standby.priority is None else standby.priority
-        core = find_core(standby.core)
+        core = self.clock_cores[1]
         return {CLOCK_STANDBY: replace(wiring, core=core, priority=priority, copy=1)}
+
+    @cached_property
+    def clock_cores(self) -> tuple[int, ...]:
+        """Cores of the clock and of its standby.
+
+        They are found once, because cores that the rack gets to itself are no longer available to
+        this process.
+        """
+        places = self.config.clock, self.config.clock.standby
+        return tuple(find_core(place.core) for place in places if place is not None)
 
     def _to_ticks(self, seconds: float) -> int:
         """Convert simulated time in s to ticks."""
@@ -336,9 +354,7 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            scheduling=(
-                build_scheduling(self._config, spec.board, spec.every) if is_executor else None
-            ),
+            scheduling=build_scheduling(self._config, ports.place, spec.every, is_locked=is_locked),
             compares=board.compare,
             votes=board.vote,
             budget_ns=round((board.busy_ms if is_executor else board.planning_ms) * 1e6),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import get_args
 
+from rack.backplane.address_map import CLOCK
 from rack.backplane.process import Reservation
 from rack.backplane.words import Scheduler
 from rack.boards.config.files import LAN_ADAPTER
-from rack.boards.config.schema import RackConfig, SchedulerName
+from rack.boards.config.schema import RackConfig, SchedulerName, TaskEntry
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.wiring import Scheduling
 
@@ -44,27 +45,52 @@ def find_clock_scheduler(config: RackConfig) -> Scheduler:
     return max([Scheduler.FIXED_PRIORITY, *found])
 
 
-def build_scheduling(config: RackConfig, board: str, every: int) -> Scheduling | None:
-    """Return how the executor of a board is scheduled. None if the config names no scheduler.
+def build_scheduling(
+    config: RackConfig, task: TaskEntry, every: int, *, is_locked: bool
+) -> Scheduling | None:
+    """Return how a task is scheduled.
 
     Args:
         config: The config of the rack.
-        board: The board.
-        every: Period of the board in ticks.
+        task: The task.
+        every: Period of the task in ticks.
+        is_locked: Whether the task is a planner whose executor must wait for its plan updates.
+
+    Returns:
+        None if the config names no scheduler, and for a planner that is not on a simulated core.
     """
-    table = config.board[board]
-    load = config.timing.lockstep_load if config.is_lockstep else 0.0
-    if not names_scheduler(config):
+    table = config.board[task.board]
+    load = config.simulated_load
+    is_planner = task.role == "planner"
+    if not names_scheduler(config) or (is_planner and not load):
         return None
-    is_with_clock = table.core == config.clock.core
+    clocks = None
+    if task.core == config.clock.core:
+        clocks = _compute_reservation(config, config.timing.clock_ms, 1)
+    locked_ms = table.budget.update_ms if is_locked and table.budget else 0.0
     return Scheduling(
-        table.core,
-        find_scheduler(config, board),
+        task.core,
+        task.priority,
+        Scheduler.FIXED_PRIORITY if is_planner else find_scheduler(config, task.board),
         is_critical=table.critical,
-        cost_ns=round(load * table.busy_ms * NS_PER_MS),
-        reservation=_compute_reservation(config, table.busy_ms, every),
-        clocks=_compute_reservation(config, config.timing.clock_ms, 1) if is_with_clock else None,
+        cost_ns=round(load * (table.planning_ms if is_planner else table.busy_ms) * NS_PER_MS),
+        switch_ns=round(2 * config.timing.context_switch_ms * NS_PER_MS),
+        locked_ns=round(load * locked_ms * NS_PER_MS),
+        ceiling=table.priority if is_locked else 0,
+        reservation=None if is_planner else _compute_reservation(config, table.busy_ms, every),
+        clocks=clocks,
     )
+
+
+def build_clock_scheduling(config: RackConfig) -> dict[str, Scheduling]:
+    """Return how the clock competes for its simulated core. Empty if it takes no time on one."""
+    cost_ns = round(config.simulated_load * config.timing.clock_ms * NS_PER_MS)
+    if not cost_ns:
+        return {}
+    clock = config.clock
+    switch_ns = round(2 * config.timing.context_switch_ms * NS_PER_MS)
+    place = clock.core, clock.priority, find_clock_scheduler(config)
+    return {CLOCK: Scheduling(*place, True, cost_ns, switch_ns, 0, 0, None, None)}
 
 
 def compute_clock_reservation(config: RackConfig) -> Reservation | None:

@@ -101,7 +101,8 @@ class ClockConfig(Table):
     budgets reserved; maximum-urgency-first: critical boards precede others, then the least laxity
     counts (lockstep only); if a config names one, an operator may change it while the rack runs"""
     on_no_realtime: Literal["refuse", "warn"] = "warn"
-    """whether to warn or to refuse the launch if the system refuses a SCHED_FIFO priority"""
+    """whether to warn or to refuse the launch if the system refuses a SCHED_FIFO priority or
+    exclusive cores"""
     period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
     """tick period [ms]; a whole number of ns"""
     mode: Mode = "realtime"
@@ -117,6 +118,9 @@ class ClockConfig(Table):
     machine"""
     core: Core = 0
     """core of the system controller"""
+    exclusive_cores: bool = False
+    """in real time, keep other processes off the rack's cores by a cgroup (version 2) for each;
+    needs root, and a core that the rack does not use; see on_no_realtime"""
     priority: Priority = 0
     """SCHED_FIFO priority of the system controller; 0 means ordinary scheduling"""
     standby: StandbyConfig | None = None
@@ -134,8 +138,9 @@ class TimingConfig(Table):
     clock_ms: Milliseconds = 0.0
     """processor time that the system clock's board needs per tick [ms]"""
     lockstep_load: float = Field(0.0, ge=0, le=1000)
-    """in lockstep, each cycle takes this multiple of its budget as simulated time, on cores under
-    the boards' schedulers, which the config must name; with 0 computing takes no simulated time"""
+    """in lockstep, each cycle and plan takes this multiple of its budget as simulated time, and two
+    context switches, on cores under the boards' schedulers, which the config must name; with 0
+    computing takes no simulated time"""
     small_share: float = Field(0.1, gt=0, le=1)
     """largest fraction of a cycle that counts as much smaller than the cycle (eq. 3.10)"""
 
@@ -458,6 +463,16 @@ class RackConfig(Table):
     def is_lockstep(self) -> bool:
         """Whether the clock runs in lockstep instead of real time."""
         return self.clock.mode == "lockstep"
+
+    @property
+    def simulated_load(self) -> float:
+        """Multiple of its budget that a cycle takes on a simulated core. 0 without such cores."""
+        return self.timing.lockstep_load if self.is_lockstep else 0.0
+
+    @property
+    def takes_time(self) -> bool:
+        """Whether computing takes time: in real time, and in lockstep on simulated cores."""
+        return not self.is_lockstep or self.simulated_load > 0
 
     @property
     def clock_ns(self) -> int:

@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
+from rack.backplane.exclusive_cores import release_cores
 from rack.backplane.segment import (
     Segment,
     find_foreign_kind,
@@ -55,6 +56,7 @@ def remove_dead_rack(rack: str) -> bool:
         with closing(ByteLock(segment.fd, 8 * Head.MAGIC)) as removal:
             if not removal.take() or not segment.is_named:
                 return False
+            release_cores(rack)
             unlink_segment(rack)
             return True
 
@@ -77,7 +79,7 @@ def remove_own_racks(rack: str | None = None, killed: Collection[int] = ()) -> N
 
 
 def remove_dead_racks() -> tuple[list[str], list[str], list[str]]:
-    """Remove every rack that is not running.
+    """Remove every rack that is not running, and release its cores.
 
     Returns:
         The names of the removed racks, the names of the racks in use, and an error text for each
@@ -94,4 +96,5 @@ def remove_dead_racks() -> tuple[list[str], list[str], list[str]]:
             in_use.append(rack)
         except SegmentError as error:
             foreign.append(str(error))
+    release_cores(in_use=in_use)
     return removed, in_use, foreign

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 
+from rack.backplane import exclusive_cores
 from rack.backplane.process import (
     DEADLINE,
     keep_cores_awake,
@@ -12,7 +13,7 @@ from rack.backplane.process import (
     reserve_time,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Scheduler
+from rack.backplane.words import Block, Scheduler, System
 from rack.boards.config.layout import list_replaced_cores
 from rack.boards.config.resolved import Resolved
 from rack.boards.config.rules import load_network_rules
@@ -58,10 +59,36 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
         raise LaunchError(f'{refusal}, and clock.on_no_realtime is "refuse". {PERMIT}')
 
 
+def reserve_cores(plan: Resolved, segment: Segment) -> Iterator[str]:
+    """Give the rack its cores to itself if the config requires it.
+
+    Yields:
+        What came of it, or that a requested core is replaced.
+
+    Raises:
+        LaunchError: The system refuses, and the config requires that it does not.
+    """
+    # Reserved cores are not available to this process.
+    yield from list_replaced_cores(plan.config)
+    clock = plan.config.clock
+    if not clock.exclusive_cores or plan.config.is_lockstep:
+        return
+    cores = {*plan.clock_cores, *(task.core for task in plan.layout.tasks)}
+    text = f"cores {', '.join(map(str, sorted(cores)))}"
+    if refusal := exclusive_cores.reserve_cores(plan.config.name, cores):
+        why = f"clock.exclusive_cores refused: {refusal}"
+        if clock.on_no_realtime == "refuse":
+            raise LaunchError(f'{why}, and clock.on_no_realtime is "refuse"', 2)
+        yield f"{why}; other processes may run on {text}"
+    else:
+        segment.words[System.EXCLUSIVE_CORES] = 1
+        yield f"other processes are kept off {text}"
+
+
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield notes on replaced cores, refused priorities and other limits of this machine."""
+    """Yield notes on refused priorities and other limits of this machine."""
     config = plan.config
-    yield from (*config.format_notes, *list_replaced_cores(config))
+    yield from config.format_notes
     if (network := load_network_rules(config)) is not None:
         yield from network.list_network_notes(config)
     if config.is_lockstep:

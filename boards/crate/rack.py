@@ -11,6 +11,7 @@ from threading import Thread
 from typing import Self
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.exclusive_cores import release_cores
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry
 from rack.backplane.segment import Segment
@@ -187,6 +188,7 @@ class Rack:
         self.begins_at = await_open_segment(crate, self._journal, LAUNCH_S)
         if before is not None and self.begins_at < 0:
             raise SnapshotError(f"rack '{self.config.name}': no snapshot before tick {before}")
+        moved += launch_checks.reserve_cores(plan, segment)
         for wiring in plan.tasks:
             crate.send_request(PowerOn(wiring.task, wiring))
         supervisor.await_ready(LAUNCH_S)
@@ -358,6 +360,7 @@ class Rack:
         finally:
             # Remove the segment by its name, because an interrupted launch may not have stored it.
             remove_own_racks(self.config.name)
+            release_cores(self.config.name, wait_s=BOARDS_END_S)
             if self._launched is not None:
                 self.segment.close()
 

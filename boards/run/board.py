@@ -38,6 +38,7 @@ from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
 
 CLOCK_LOCK = "rack.boards.run.clock_standby"
+EXCLUSIVE_CORES = "rack.backplane.exclusive_cores"
 REPLICA = "rack.boards.run.replica"
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
@@ -181,8 +182,16 @@ def _take_scheduled_core(segment: Segment, wiring: TaskWiring) -> None:
         block[Block.SCHEDULER] = block[Block.SCHEDULER] or wiring.scheduling.scheduler
         if block[Block.SCHEDULER] == Scheduler.EARLIEST_DEADLINE_FIRST:
             reservation = wiring.scheduling.reservation
+    _enter_exclusive_core(segment, spec.core)
     block[Block.PRIORITY] = take_core(spec.core, spec.priority, reservation)
     block[Block.CORE] = spec.core
+
+
+def _enter_exclusive_core(segment: Segment, core: int) -> None:
+    """Enter the group of a core that the rack has to itself."""
+    if segment.words[System.EXCLUSIVE_CORES]:
+        # Import it only in racks that need it.
+        import_module(EXCLUSIVE_CORES).enter_core(segment.rack, core)
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
@@ -198,6 +207,7 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
         The exit status of the board.
     """
     copier = Copier(segment, CLOCK, copies) if has_snapshots_enabled(segment) else None
+    _enter_exclusive_core(segment, wiring.core)
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Memory is not touched in advance, because every board waits for the start of the clock. The
     # clock's lead over its grid points leaves enough time for a page fault.

@@ -9,7 +9,6 @@ cycles.
 
 from __future__ import annotations
 
-from importlib import import_module
 from time import monotonic_ns
 
 from rack.backplane.process import set_priority
@@ -23,7 +22,6 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ArmState
 
-SIMULATED_CORES = "rack.boards.run.simulated_cores"
 _DEMANDS = tuple(Demand)
 
 
@@ -71,12 +69,6 @@ class VirtualControlLoop(Task):
             self.serve, slow_access(reads, times.read_ns), settings
         )
         self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
-        if wiring.scheduling is not None and wiring.scheduling.cost_ns:
-            # Import it only in racks that need it.
-            # The step of an interrupt handler includes the budget of the cycle.
-            cost_ns = 0 if self.serve else wiring.scheduling.cost_ns
-            step = import_module(SIMULATED_CORES).CoreStep(self, cost_ns)
-            self.simulated.steps.append(step)
 
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""

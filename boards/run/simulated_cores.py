@@ -2,7 +2,8 @@
 
 The clock simulates the cores tick by tick. Each cycle computes, states its processor time, and
 waits. The clock lets it go on in the tick in which its scheduler lets its job end. Other cycles of
-the core, and changes of a scheduler, thus act on jobs that have begun.
+the core, and changes of a scheduler, thus act on jobs that have begun. Plans do the same. Each job
+takes two context switches as well, and the clock a job in each tick: as in the timing model.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.words import Block, Run, Scheduler, System
 from rack.boards.timing.scheduler import CoreJob, SimulatedCore
@@ -29,7 +31,7 @@ class CoreStep:
 
     Args:
         task: The task.
-        cost_ns: Processor time of a cycle without the other steps.
+        cost_ns: Processor time of a cycle or plan without the other steps.
     """
 
     def __init__(self, task: Task, cost_ns: int) -> None:
@@ -41,17 +43,19 @@ class CoreStep:
         task = self._task
         task.block[Block.COMPUTING_NS] = self._cost_ns + end_ns - begin_ns
         task.next_cycle.wait_for_tick(UNKNOWN)
+        end_ns = task.block[Block.COMPUTING_NS]
         if task.words[System.STATE] == Run.STOPPED:
             # The job is late if its deadline is not after the run.
-            return (task.words[System.TICK] + 1) * task.simulated.clock_ns
-        return task.block[Block.COMPUTING_NS]
+            end_ns = (task.words[System.TICK] + 1) * task.simulated.clock_ns
+        task.stopwatch.core_ns = max(begin_ns, task.block[Block.BEGUN_NS]), end_ns
+        return end_ns
 
 
 class SimulatedCores:
     """The simulated cores of a rack.
 
     Args:
-        loads: How the executors compete for the cores, by task.
+        loads: How the tasks, and the clock if it takes time, compete for the cores, by task.
         driver: Driver of the clock.
         clock_ns: Length of a tick in ns.
     """
@@ -74,22 +78,34 @@ class SimulatedCores:
         self._driver.resume_cycles(tick)
         begin_ns = tick * self._clock_ns
         for number, core in self._cores.items():
-            core.jobs = [job for job in core.jobs if not self._tasks[job.task].is_lost]
-            for begun in core.jobs:
-                # An operator may have changed it.
-                begun.scheduler = Scheduler(self._tasks[begun.task].block[Block.SCHEDULER])
+            core.jobs = [j for j in core.jobs if j.task == CLOCK or not self._tasks[j.task].is_lost]
             under_way = {job.task for job in core.jobs}
             for name, load in self._loads.items():
                 if load.core == number and name not in under_way:
                     self._add_job(core, name, begin_ns)
+            for begun in core.jobs:
+                # An operator may have changed it.
+                begun.scheduler = self._find_scheduler(begun.task)
             while (job := core.run_until(begin_ns + self._clock_ns)) is not None:
+                if job.task == CLOCK:
+                    continue
                 task = self._tasks[job.task]
                 # A job that ends with the tick ends in it.
                 task.block[Block.COMPUTING_NS] = min(core.now_ns, begin_ns + self._clock_ns - 1)
+                task.block[Block.BEGUN_NS] = job.begun_ns
                 self._driver.resume_cycle(task)
                 # If the job has missed its deadline, the cycle waits once more.
                 self._driver.resume_cycles(tick)
                 self._add_job(core, job.task, core.now_ns)
+
+    def _find_scheduler(self, name: str) -> Scheduler:
+        """Return the present scheduler of a task. The clock has the first of those on its core."""
+        if name != CLOCK:
+            return Scheduler(self._tasks[name].block[Block.SCHEDULER])
+        core = self._loads[CLOCK].core
+        others = [other for other, load in self._loads.items() if load.core == core]
+        schedulers = (self._find_scheduler(other) for other in others if other != CLOCK)
+        return max(schedulers, default=Scheduler.FIXED_PRIORITY)
 
     def _add_job(self, core: SimulatedCore, name: str, ready_at: int) -> None:
         """Add the job of the release that a task has taken, if there is one.
@@ -99,23 +115,31 @@ class SimulatedCores:
             name: Name of the task.
             ready_at: Time in ns from which the job can run.
         """
-        task = self._tasks[name]
-        block = task.block
-        release = block[Block.RELEASED]
-        if release > block[Block.DONE]:
-            self._driver.await_state(
-                task, lambda: task.is_waiting or task.is_lost or task.is_stopped
+        load = self._loads[name]
+        clock_ns = self._clock_ns
+        if name == CLOCK:
+            release, every, cost_ns = ready_at // clock_ns, 1, load.cost_ns
+        else:
+            task = self._tasks[name]
+            block = task.block
+            release = block[Block.RELEASED]
+            if release > block[Block.DONE]:
+                # If a planner makes no plan, there is no job.
+                self._driver.await_state(task, task.is_settled)
+            if block[Block.FINISH] != UNKNOWN:
+                return
+            every, cost_ns = task.spec.slice, block[Block.COMPUTING_NS]
+        core.jobs.append(
+            CoreJob(
+                name,
+                release,
+                self._find_scheduler(name),
+                load.priority,
+                load.is_critical,
+                ready_at,
+                deadline_ns=(release + every) * clock_ns,
+                left_ns=cost_ns + load.switch_ns,
+                locked_ns=load.locked_ns,
+                ceiling=load.ceiling,
             )
-        if block[Block.FINISH] == UNKNOWN:
-            core.jobs.append(
-                CoreJob(
-                    name,
-                    release,
-                    Scheduler(block[Block.SCHEDULER]),
-                    task.spec.priority,
-                    self._loads[name].is_critical,
-                    ready_at,
-                    deadline_ns=(release + task.spec.every) * self._clock_ns,
-                    left_ns=block[Block.COMPUTING_NS],
-                )
-            )
+        )

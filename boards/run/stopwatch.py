@@ -40,6 +40,8 @@ class Stopwatch:
         read_ns: End of the reading of command, status and plan (R).
         process_ns: End of the level's `process` or `plan` (X, P).
         end_ns: End of the writing of all outputs (W, U).
+        core_ns: On a simulated core, begin and end of the cycle in simulated ns since tick 0.
+            The trace then has simulated times, except for the processor time.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Stopwatch:
         self.is_late = True
         self.has_missed = False
         self.late_ns = 0
+        self.core_ns: tuple[int, int] | None = None
         self.start_ns = self.plan_ns = self.read_ns = self.process_ns = self.end_ns = 0
 
     def start_counting(self) -> None:
@@ -138,6 +141,8 @@ class Stopwatch:
         if state != self._state:
             self._state = block[Block.LEVEL_STATE] = state
             block[Block.LEVEL_SINCE] = tick
+        if self.core_ns is not None:
+            self._simulate_stamps(*self.core_ns)
         used_ns = thread_time_ns()
         used_before_ns = self._processor_ns
         self._processor_ns = used_ns
@@ -163,6 +168,25 @@ class Stopwatch:
             # This was the last release of a batch, or the clock waits for a late cycle.
             lockstep_done.release()
         self._closed_ns = monotonic_ns()
+
+    def _simulate_stamps(self, begin_ns: int, end_ns: int) -> None:
+        """Replace the time stamps of the cycle by those on a simulated core.
+
+        Reading and writing take their real times, as far as the simulated time is long enough.
+
+        Args:
+            begin_ns: Begin of the cycle in simulated ns since tick 0.
+            end_ns: Its end.
+        """
+        epoch_ns = self._words[System.EPOCH_NS]
+        wrote_ns = self.end_ns - self.process_ns
+        later_ns = epoch_ns + begin_ns - self.start_ns
+        self._release_ns = epoch_ns + self._tick * self._period_ns
+        self.end_ns = end_ns = epoch_ns + end_ns
+        self.start_ns += later_ns
+        self.plan_ns = min(self.plan_ns + later_ns, end_ns)
+        self.read_ns = min(self.read_ns + later_ns, end_ns)
+        self.process_ns = max(self.read_ns, end_ns - wrote_ns)
 
     def _compute_time_ns(self, tick: int) -> int:
         """Return the grid point of a tick, in ns of CLOCK_MONOTONIC."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from importlib import import_module
 from time import process_time_ns
 from typing import ClassVar, ParamSpec, TypeVar
 
@@ -22,6 +23,7 @@ from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
+SIMULATED_CORES = "rack.boards.run.simulated_cores"
 PUNCTUAL_TICKS = 20
 """Number of ticks without a late one after which the next late tick raises an alarm again."""
 _P = ParamSpec("_P")
@@ -83,6 +85,12 @@ class Task(ABC):
         # Without a budget, computing takes no simulated time that a handler could preempt.
         if handler is not None and (wiring.budget_ns or not self.clock.is_lockstep):
             self.simulated.steps.append(handler.preempt_computing)
+        if wiring.scheduling is not None and wiring.scheduling.cost_ns:
+            # Import it only in racks that need it.
+            # The step of an interrupt handler includes the budget of the cycle.
+            cost_ns = 0 if handler else wiring.scheduling.cost_ns
+            step = import_module(SIMULATED_CORES).CoreStep(self, cost_ns)
+            self.simulated.steps.append(step)
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:

@@ -119,8 +119,8 @@ def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     known = [board for board in rack.boards.values() if board.budget is not None]
     if known and rack.is_lockstep:
         yield (
-            "in lockstep a tick waits for late tasks; these are the times of the same rack in real"
-            " time"
+            "in lockstep a tick waits for late tasks, unless timing.lockstep_load is set; these are"
+            " the times of the same rack in real time"
         )
     if known and rack.speed != 1.0:
         yield (f"times are wall-clock times: speed {rack.speed:g} changes cycles but not budgets")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.words import Scheduler
+from rack.boards.timing.response_time import TURN_NS
 from rack.boards.timing.schedule import simulate_core
 from rack.boards.timing.tasks import Urgency, compute_urgency
 
@@ -22,6 +23,11 @@ class CoreJob:
         ready_at: Time in ns from which the job can run.
         deadline_ns: Deadline of the job.
         left_ns: Processor time that the job still needs. 0 when it has ended.
+        locked_ns: Processor time at the end of the job in which its priority is the ceiling.
+        ceiling: Priority of this part.
+        turn_at: Time from which a job under ordinary scheduling waits for its turn.
+        turn_ns: Rest of that turn.
+        begun_ns: Time at which the job began. -1 if it has not.
     """
 
     task: str
@@ -32,22 +38,35 @@ class CoreJob:
     ready_at: int
     deadline_ns: int
     left_ns: int
+    locked_ns: int = 0
+    ceiling: int = 0
+    turn_at: int = -1
+    turn_ns: int = TURN_NS
+    begun_ns: int = -1
 
     def get_urgency(self, now_ns: int) -> Urgency:
         """Return its urgency at a time. Of equal jobs, the one released first runs."""
+        is_locked = self.left_ns < self.locked_ns
         laxity_ns = self.deadline_ns - now_ns - self.left_ns
         urgency = compute_urgency(
             self.scheduler,
-            self.priority,
+            max(self.priority, self.ceiling) if is_locked else self.priority,
             self.deadline_ns,
             laxity_ns,
             is_critical=self.is_critical,
         )
-        return *urgency, self.ready_at, self.task
+        return *urgency, not is_locked, max(self.ready_at, self.turn_at), self.task
 
     def run_step(self, now_ns: int, until_ns: int) -> int:
-        """Run the job until it ends or the time is over, and return the end in ns."""
+        """Run the job until it ends or its turn or the time is over, and return the end in ns."""
+        if self.begun_ns < 0:
+            self.begun_ns = now_ns
         end = min(now_ns + self.left_ns, until_ns)
+        if not self.priority:
+            end = min(end, now_ns + self.turn_ns)
+            self.turn_ns -= end - now_ns
+            if not self.turn_ns:
+                self.turn_at, self.turn_ns = end, TURN_NS
         self.left_ns -= end - now_ns
         return end
 

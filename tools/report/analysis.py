@@ -95,6 +95,11 @@ class Analysis:
     pairs: tuple[EquationPair, ...]
     typical_pairs: tuple[EquationPair, ...]
 
+    @property
+    def takes_time(self) -> bool:
+        """Whether computing took time: in real time, or on simulated cores."""
+        return self.recording.rack_config.takes_time
+
     @classmethod
     def from_recording(
         cls,
@@ -135,7 +140,7 @@ class Analysis:
             rack = build_rack_timing(config, layout, budgets)
             observed = [
                 *_judge_response(response, rack),
-                *_judge_tasks(cycles, rack, percent),
+                *_judge_tasks(cycles, rack, percent, config.takes_time),
                 *used,
             ]
             derived = [
@@ -211,11 +216,17 @@ def _judge_response(
 
 
 def _judge_tasks(
-    cycles_by_task: Mapping[str, Cycles], rack: RackTiming, percentile: float
+    cycles_by_task: Mapping[str, Cycles], rack: RackTiming, percentile: float, takes_time: bool
 ) -> Iterator[EquationVerdict]:
     """Yield verdicts on eq. 3.7 for executors, and on the response times of all tasks.
 
-    Response times are evaluated only for runs in real time.
+    Response times are evaluated only if computing takes time.
+
+    Args:
+        cycles_by_task: Measured cycles of the run.
+        rack: Timing of the rack.
+        percentile: Percentage of the cycles that must fulfil an equation.
+        takes_time: Whether computing took time: in real time, or on simulated cores.
     """
     for name, cycles in cycles_by_task.items():
         rows = cycles.rows
@@ -226,7 +237,7 @@ def _judge_tasks(
             steps_ns = (1 + trace_times.count_skipped_releases(rows)) * every_ns
             step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
-        if not rack.is_lockstep:
+        if takes_time:
             deadline_ns = compute_due_ns(rack, cycles.task)
             response_ns = trace_times.compute_response_ns(rows)
             worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)

@@ -23,6 +23,7 @@ HYPERVISOR = "hypervisor"
 CORE_TAKEN = "core taken from the rack"
 OWN_EXECUTION = "own execution"
 NOT_RECORDED = "not recorded"
+SIMULATED_CORE = "simulated core busy"
 Causes = dict[tuple[str, int], tuple[str, int]]
 """Cause of lost cycles and its duration in ns, by task and tick of the first lost cycle."""
 
@@ -48,10 +49,11 @@ def add_causes(
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(
         recording.end_counts.get("faults", ())
     )
+    otherwise = SIMULATED_CORE if recording.rack_config.simulated_load else NOT_RECORDED
     explained = []
     for miss in misses:
         task = layout.find_task(miss["task"])
-        why, ns = causes.get((task.name, miss["tick"]), (NOT_RECORDED, 0))
+        why, ns = causes.get((task.name, miss["tick"]), (otherwise, 0))
         if fault := next(_list_faults(recording, task, miss, strikes), ""):
             why, ns = fault, 0
         # The kernel counts steal in steps that are longer than most delays.

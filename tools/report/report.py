@@ -191,6 +191,7 @@ def _build_head(
     return RunReport(
         rack=config.name,
         mode=config.clock.mode,
+        takes_time=config.takes_time,
         speed=config.clock.speed,
         clock_ms=config.clock.period_ms,
         **build_verdict(ended, response),
@@ -209,14 +210,13 @@ def _build_head(
 
 def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
     """Return the entry of a task in the report: role, slot, rate, counts and times."""
-    is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.read_trace(task.name)
     missed, skipped = count_misses_and_skips(cycles)
     # If the end of the run was not recorded, the trace has the only counts.
     counts = recording.find_task_counts(task.name) or {"missed": missed, "skipped": skipped}
     stretches = recording.find_stretches(cycles["tick"])
-    period_ns = layout.clock_ns if is_lockstep else config.tick_ns
+    period_ns = layout.clock_ns if config.is_lockstep else config.tick_ns
     entry = {
         **_describe_task(task, layout),
         **counts,
@@ -224,7 +224,7 @@ def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) 
             task,
             cycles,
             period_ns,
-            is_lockstep,
+            config.takes_time,
             stretches=stretches,
             due_ns=layout.compute_due_ticks(task) * period_ns,
         ),

@@ -16,6 +16,7 @@ class RunReport:
     was not recorded, or if it does not apply to the rack.
 
     Attributes:
+        takes_time: Whether computing took time: in real time, or on simulated cores.
         worked: The verdict: True if the run succeeded.
         failures: Reasons why the run failed. Empty if it succeeded.
         unjudged: Aspects that the verdict does not cover.
@@ -29,6 +30,7 @@ class RunReport:
 
     rack: str
     mode: str
+    takes_time: bool
     speed: float
     clock_ms: float
     worked: bool

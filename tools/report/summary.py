@@ -124,8 +124,9 @@ def _format_headline(report: RunReport, width: int, name: str, task: Document) -
         verdict += f", {report.outcome['cause']},"
     mode, right = "lockstep", "timing: no deadlines in lockstep"
     if report.mode != "lockstep":
-        speed = "" if report.speed == 1.0 else f" x {report.speed:g}"
-        mode, right = f"real time{speed}", "timing: no cycle missed"
+        mode = "real time" if report.speed == 1.0 else f"real time x {report.speed:g}"
+    if report.takes_time:
+        right = "timing: no cycle missed"
     if _count_losses(task):
         verb = "missed" if task["missed"] else "skipped"
         due = task.get("due") or task["traced"] + task["skipped"]
@@ -168,7 +169,7 @@ def _format_tasks(
         row["proc p99"] = format_figure(times, "p99", 2)
         row["used %"] = f"{_compute_use(task):.0f}" if times else None
         row |= {kind: task.get(kind) for kind in ("missed", "skipped")}
-        if report.mode != "lockstep":
+        if report.takes_time:
             row["late ms"] = format_figure(task.get("lateness_ms"), "max", 2)
         rows.append(row)
     lines = [*render_text([TextTable(rows, DROPPED)], width)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rack.boards.timing.level import LevelTiming
-from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
 from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Document
@@ -52,8 +51,7 @@ def build_document(analysis: Analysis) -> Document:
             for name in config.board
         },
         "tasks": {
-            name: build_task_document(cycles, analysis.predicted)
-            for name, cycles in analysis.cycles.items()
+            name: build_task_document(cycles, analysis) for name, cycles in analysis.cycles.items()
         },
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
         "equations": [
@@ -85,12 +83,13 @@ def _build_sides(predicted: _Side, measured: _Side) -> Document:
     }
 
 
-def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
+def build_task_document(cycles: Cycles, analysis: Analysis) -> Document:
     """Return counts and times in ms of a task's cycles, without start-up and stalled cycles.
 
     The result includes the entries of `compute_task_times`, in which execution and communication
     are processor times.
     """
+    rack = analysis.predicted
     judged = cycles.is_judged
     rows = cycles.rows[judged]
     missed, skipped = count_misses_and_skips(rows)
@@ -109,7 +108,7 @@ def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
             cycles.task,
             rows,
             rack.tick_ns,
-            rack.is_lockstep,
+            analysis.takes_time,
             stretches=cycles.stretches[judged],
             due_ns=compute_due_ns(rack, cycles.task),
             parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
@@ -142,10 +141,9 @@ def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
     yield ""
     yield "Tasks, ms: exec and comm are processor time; R of a planner is its time slice."
     tasks = {
-        name: build_task_document(cycles, analysis.predicted)
-        for name, cycles in analysis.cycles.items()
+        name: build_task_document(cycles, analysis) for name, cycles in analysis.cycles.items()
     }
-    yield build_times_table(tasks, analysis.predicted.is_lockstep)
+    yield build_times_table(tasks, analysis.takes_time)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
     yield build_verdict_table(
         (side, verdict)
@@ -187,7 +185,8 @@ def _format_summary(analysis: Analysis) -> Iterator[str]:
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
-        yield "lockstep: no deadlines, no lateness; processor times are real"
+        has_none = "simulated cores" if analysis.takes_time else "no deadlines, no lateness"
+        yield f"lockstep: {has_none}; processor times are real"
     if restarted := list_restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
     yield from _list_unjudged(analysis)

@@ -60,7 +60,7 @@ def compute_task_times(
     task: TaskSpec,
     cycles: np.ndarray,
     period_ns: int,
-    is_lockstep: bool,
+    takes_time: bool,
     *,
     stretches: np.ndarray,
     due_ns: int,
@@ -76,7 +76,7 @@ def compute_task_times(
         task: The task.
         cycles: Trace records of the task, shape (n,).
         period_ns: Length of a tick on the wall clock.
-        is_lockstep: Whether the run was in lockstep.
+        takes_time: Whether computing took time: in real time, or on simulated cores.
         stretches: Number of the recorded stretch of each cycle, shape (n,). Gaps are measured only
             between cycles of the same stretch.
         due_ns: Time from a release to the deadline.
@@ -110,13 +110,13 @@ def compute_task_times(
         "execution_ms": compute_distribution(execution * MS_PER_NS),
         "communication_ms": compute_distribution(communication * MS_PER_NS),
         "processor_ms": compute_distribution(cycles["processor_ns"] * MS_PER_NS),
-        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
+        **(by_the_clock if takes_time else dict.fromkeys(by_the_clock)),
     }
 
 
-def build_times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
-    """Return a table with one line per task. In lockstep it has only the columns that apply."""
-    columns = USED_COLUMNS if is_lockstep else CLOCK_COLUMNS | USED_COLUMNS
+def build_times_table(tasks: Mapping[str, Document], takes_time: bool) -> TextTable:
+    """Return a table with one line per task, and only the columns that apply in lockstep."""
+    columns = CLOCK_COLUMNS | USED_COLUMNS if takes_time else USED_COLUMNS
     rows = [
         {
             "task": name,
@@ -136,9 +136,8 @@ def build_times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextT
 
 def format_times(report: RunReport) -> Blocks:
     """Yield the section of a report with the table of cycle times."""
-    is_lockstep = report.mode == "lockstep"
     yield from ("", "## Cycles, ms", "")
-    if is_lockstep:
+    if not report.takes_time:
         yield (
             "In lockstep a tick lasts as long as its tasks take, so there are no deadlines, no"
             " lateness and no residuals, except in cycles that take simulated time."
@@ -146,4 +145,4 @@ def format_times(report: RunReport) -> Blocks:
         yield ""
     for name, (traced, ran) in report.untraced.items():
         yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
-    yield build_times_table(report.tasks, is_lockstep)
+    yield build_times_table(report.tasks, report.takes_time)

@@ -238,7 +238,7 @@ def check_schedulers(wiring: Wiring) -> Mistakes:
     """Check that each board can have its scheduler, and can take simulated time if it has to."""
     config = wiring.config
     reported = set[str]()
-    load = config.timing.lockstep_load if config.is_lockstep else 0.0
+    load = config.simulated_load
     if load and not names_scheduler(config):
         yield Mistake("timing.lockstep_load", load, "needs clock.scheduler, which is missing")
     for name, board in config.board.items():
@@ -257,9 +257,9 @@ def check_schedulers(wiring: Wiring) -> Mistakes:
         elif load and not board.busy_ms:
             why = "missing; a cycle takes this time, times timing.lockstep_load"
             yield Mistake(f"board.{name}.budget", None, why)
-        if load and board.planner is not None:
-            why = f"'{name}' has a planner, which would take no simulated time"
-            yield Mistake("timing.lockstep_load", load, why)
+        if load and board.planner is not None and not board.planning_ms:
+            why = "missing; a plan takes this time, times timing.lockstep_load"
+            yield Mistake(f"board.{name}.budget.plan_ms", None, why)
 
 
 def check_schedule(wiring: Wiring) -> Mistakes:

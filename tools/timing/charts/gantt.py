@@ -190,7 +190,7 @@ def build_gantt(
     panels: list[Panel] = []
     notes: list[str] = []
     schedule = Schedule(subject.config, subject.layout) if read_budgets(subject.config) else None
-    if run is not None and not subject.config.is_lockstep:
+    if run is not None and subject.config.takes_time:
         task = choose_task(run.tasks)
         start, end = options.choose_window(task, run.end_ns, run.find_middle_ns(task))
         panels.append(run.build_panel(start, end, progress))

@@ -1,0 +1,146 @@
+"""Simulated cores: what `rack check` says fits is never late in lockstep, and what does not is."""
+
+from __future__ import annotations
+
+import pytest
+
+from rack.backplane.trace import open_trace_ring
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.config import build_rack_timing, resolve
+from rack.boards.errors import ConfigError
+from rack.boards.timing.trace_times import compute_response_ns
+from tests.boards.conftest import MakeConfig
+
+RACK = """
+format = 2
+name = "shared-core"
+
+[clock]
+period_ms = 1.0
+mode = "lockstep"
+priority = 90
+scheduler = "fixed-priority"
+
+[timing]
+lockstep_load = 1.0
+context_switch_ms = 0.05
+clock_ms = 0.1
+
+[board.level]
+slot = 2
+every = 4
+executor = "rack.levels.systems.figures:FigureExecutor"
+planner = "rack.levels.systems.figures:FigurePlanner"
+coupling = "tight"
+within_cycles = 3
+priority = 80
+planner_priority = 40
+params = { process_ms = 0.0, plan_ms = 0.0 }
+budget = { process_ms = 0.9, plan_ms = 3.0, update_ms = 0.4 }
+
+[board.beside]
+slot = 3
+every = 6
+executor = "rack.levels.systems.figures:FigureLoop"
+priority = 60
+params = { process_ms = 0.0 }
+budget = { process_ms = 1.4 }
+"""
+"""With the clock and all context switches, the tasks need 0.992 of the core."""
+
+CRITICAL = 'protocol.mailbox={ "level.plan" = "lock" }'
+ORDINARY = ("board.beside.priority=0", "board.level.planner_priority=0")
+EARLIEST = "clock.scheduler=earliest-deadline-first"
+URGENCY = "clock.scheduler=maximum-urgency-first"
+LOOSE = ("board.level.coupling=loose", "board.level.planner_slot=4", "board.level.planner_core=0")
+
+
+PLANNER = "level.planner"
+ABOVE = ("board.level.planner_priority=70", "board.level.budget.plan_ms=1.2")
+SETS = {
+    "tight": ((), ()),
+    "switches": (("timing.context_switch_ms=0.07",), (PLANNER,)),
+    "clock": (("timing.clock_ms=0.2",), (PLANNER,)),
+    "plan": (("board.level.budget.plan_ms=3.4",), (PLANNER,)),
+    "update": ((CRITICAL,), ()),
+    "long update": (
+        (CRITICAL, "board.level.budget.plan_ms=0.1", "board.level.budget.update_ms=3.3"),
+        ("level", "beside"),
+    ),
+    "planner above a board": (ABOVE, ("beside",)),
+    "room for that board": ((*ABOVE, "board.beside.every=12"), ()),
+    "turns": ((*ORDINARY, "board.beside.every=12"), ()),
+    "turns of a long plan": (
+        (*ORDINARY, "board.level.budget.plan_ms=11", "board.level.within_cycles=9"),
+        ("beside", PLANNER),
+    ),
+    "turns of a long plan with room": (
+        (
+            *ORDINARY,
+            "board.level.budget.plan_ms=11",
+            "board.level.within_cycles=9",
+            "board.beside.every=18",
+        ),
+        (),
+    ),
+    "deadlines": ((*LOOSE, EARLIEST), ()),
+    "deadlines above a planner": (
+        (*LOOSE, EARLIEST, "board.beside.budget.process_ms=1.6"),
+        (PLANNER,),
+    ),
+    "urgency": ((URGENCY,), ()),
+    "urgency above a planner": (
+        (URGENCY, "board.level.critical=true", "board.level.budget.process_ms=1.0"),
+        (PLANNER,),
+    ),
+}
+"""Settings of the rack, and the tasks that do not fit."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("settings", "failing"), SETS.values(), ids=SETS)
+def test_lockstep_agrees_with_the_check(
+    config: MakeConfig, settings: tuple[str, ...], failing: tuple[str, ...]
+) -> None:
+    rack = config(*settings, text=RACK)
+    predicted = {
+        each.task: each for each in build_rack_timing(rack, resolve(rack).layout).responses
+    }
+    assert {each.task for each in predicted.values() if not each.holds} == {*failing}
+    late = set()
+    with Rack(rack) as crate:
+        crate.run(0.2)
+        for task in crate.segment.layout.tasks:
+            block = crate.segment.get_block(task.name)
+            assert block[Block.CYCLES] > 3
+            if block[Block.MISSED] + block[Block.SKIPPED]:
+                late.add(task.name)
+            elif bound_ns := predicted[task.name].response_ns:
+                assert 0 < find_longest_ns(crate, task.name) <= bound_ns
+    assert late <= {*failing}
+    assert bool(late) == bool(failing)
+
+
+def find_longest_ns(crate: Rack, task: str) -> int:
+    """Return the longest response in the trace of a task."""
+    rows = open_trace_ring(crate.segment, task).read_new_rows().rows
+    return int(compute_response_ns(rows).max())
+
+
+@pytest.mark.slow
+def test_the_longest_response_is_the_predicted_one(config: MakeConfig) -> None:
+    rack = config(text=RACK)
+    predicted = build_rack_timing(rack, resolve(rack).layout).responses
+    with Rack(rack) as crate:
+        crate.run(0.1)
+        for each in predicted:
+            if each.task != "clock":
+                assert find_longest_ns(crate, each.task) == each.response_ns
+
+
+def test_a_plan_without_a_budget_is_refused(config: MakeConfig) -> None:
+    rack = config(*(f"board.level.budget.{part}_ms=0" for part in ("plan", "update")), text=RACK)
+    with pytest.raises(ConfigError) as error:
+        resolve(rack)
+    assert "board.level.budget.plan_ms: missing; a plan takes this time, times" in str(error.value)
