@@ -1,10 +1,10 @@
 """Programs that tests start often, ready to run: forked from a process that has their libraries.
 
 Each rack has a crate and most have a recorder, and to import numpy, pydantic and pyarrow for them
-would be most of the suite's processor time. A stock process imports a program's libraries, and runs
-nothing of it. Each start is a fork of it that runs the program from the top of its `__main__` on: a
-child of the test's process, with the arguments, environment, folder and descriptors that
-`subprocess` would give it.
+would be most of the suite's processor time. A stock process imports a program's libraries, for a
+crate also the machine code of an arm's levels, and runs nothing of the program. Each start is a
+fork of it that runs the program from the top of its `__main__` on: a child of the test's process,
+with the arguments, environment, folder and descriptors that `subprocess` would give it.
 
 What such a fork would not inherit starts as ever: in a process that a test has forked, or whose
 user, limits, processors or namespaces are not those that the tests began with. Racks that tests
@@ -34,9 +34,11 @@ from typing import Any, NamedTuple
 from rack.boards.crate.line import build_environment
 from tests.processes import children_of
 
+CRATE = "rack.boards.crate"
 LIBRARIES = {
-    "rack.boards.crate": ("rack.boards.crate.crate", "numba"),
+    CRATE: ("rack.boards.crate.crate",),
     "rack.tools.recording.recorder": (
+        "numpy.strings",
         "rack.boards.config.commands",
         "rack.levels.systems.joint_boards.messages",
         "rack.tools.recording.recorder.recorder",
@@ -206,6 +208,25 @@ def _take_over(order: Order, fds: Sequence[int]) -> None:
     sys.path[:] = [order.folder, *dict.fromkeys([*given, *sys.path])]
 
 
+def load_levels() -> None:
+    """Import the levels of NASREM, load their machine code and that for mailboxes, and compile the
+    cell, which a crate otherwise does for each rack."""
+    from rack.boards.config import load
+    from rack.boards.config.resolved import list_class_names
+    from rack.boards.crate.rack import build_cell_config
+    from rack.boards.run.compiled_mailbox import load_machine_code
+    from rack.levels.references import find_class
+    from rack.levels.robot.cell import build_cell
+
+    load_machine_code()
+    nasrem = load("nasrem")
+    for name in list_class_names(nasrem):
+        level: Any = find_class(name, object, in_child_first=False)
+        level.preload()
+    if (cell := build_cell_config(nasrem)) is not None:
+        build_cell(cell.robot, cell.scene, cell.clock_ns)
+
+
 def main() -> None:
     """Keep a program in stock; the arguments are the descriptor of the line, and its module."""
     # Ctrl-C is for the tests.
@@ -213,6 +234,8 @@ def main() -> None:
     number, module = sys.argv[1:]
     for library in LIBRARIES[module]:
         importlib.import_module(library)
+    if module == CRATE:
+        load_levels()
     gc.freeze()
     if order := served(socket.socket(fileno=int(number))):
         runpy.run_module(order.module, run_name="__main__", alter_sys=True)

@@ -185,7 +185,8 @@ class Crate:
         If the rack continues a run, the memory of the segment is restored from a snapshot.
         """
         self._opened = segment = Segment.attach(opening.rack)
-        record_used_files()
+        if not segment.words[System.LOCKSTEP]:
+            record_used_files()
         set_priority(opening.priority)
         snapshot = None if opening.before is None else self._shelf.find_nearest(opening.before)
         if snapshot is not None:

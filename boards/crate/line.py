@@ -17,6 +17,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Self
 
+from rack.backplane.process import wait_readable
 from rack.boards.crate.output import split_lines
 from rack.boards.crate.requests import Leave, Left, Show, Shown
 from rack.boards.errors import LaunchError
@@ -127,11 +128,12 @@ class CrateLine:
             return
         self._is_closed = True
         self.line.close()
-        try:
-            self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
+        # `Popen.wait` with a time-out sleeps in steps of up to 50 ms, which delays every end.
+        ended = os.pidfd_open(self._process.pid)
+        if not wait_readable(ended, timeout_s):
             self._process.kill()
-            self._process.wait()
+        self._process.wait()
+        os.close(ended)
         os.close(self.attention)
         os.close(self._printed)
 
