@@ -139,7 +139,9 @@ class Writer:
             pid = self._claimed[Box.WRITER_PID]
             self._claim.close()
             raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
-        return self._begin_epoch()
+        head = self._claimed[Box.HEAD]
+        self._begin_epoch(head)
+        return head
 
     def take_over(self) -> None:
         """Claim the mailbox in a new epoch, even if the process of its writer is alive.
@@ -148,7 +150,9 @@ class Writer:
         it holds the lock on the hand-over: see `rack.backplane.standby`.
         """
         self.try_lock()
-        self._continue_after(self._begin_epoch())
+        head = self.slots.find_newest()
+        self._begin_epoch(head)
+        self._continue_after(head)
 
     @property
     def holds_claim(self) -> bool:
@@ -165,16 +169,15 @@ class Writer:
         self.has_claim = self.is_locked = False
         self._claim.release()
 
-    def _begin_epoch(self) -> int:
+    def _begin_epoch(self, head: int) -> None:
         """Enter this process in the head of the mailbox as its writer.
 
-        Returns:
-            Serial of the newest message of the previous writer.
+        Args:
+            head: Serial of the newest message of the previous writer.
         """
         box = self._claimed
-        epoch = get_epoch(box[Box.EPOCH] + 1)
-        # A previous writer that was stopped may store this word again at any time, so load it once.
-        head = box[Box.HEAD]
+        # A process that was killed before it stored its claim has used no epoch.
+        epoch = get_epoch(box[Box.CLAIMANT] + 1)
         box[Box.BEGUN + epoch % Box.EPOCHS] = head
         # A reader that finds the new claim must find the word that belongs to it.
         self.slots.fence()
@@ -187,7 +190,6 @@ class Writer:
         self.slots.signature = signature
         self.slots.chain = chain
         self.has_claim = True
-        return head
 
     def _continue_after(self, head: int) -> None:
         """Continue after the newest message of the previous writer, which has this serial."""
