@@ -213,6 +213,11 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.apply_faults(chosen)
 
+    def find_content(self, tick: int) -> bytes | memoryview:
+        """Return the message that a standby holds back in the cycle released at `tick`."""
+        faulty = self._faulty
+        return self.writer.message.raw if faulty is None else faulty.find_content(tick)
+
     @property
     def is_faulty(self) -> bool:
         """True if faults act on the mailbox, or delayed messages are still to be published."""
@@ -301,17 +306,17 @@ class OutputPorts:
             if port in level.outputs
         }
         self.writers = {port: self.open_writer(segment, name) for port, name in mailboxes.items()}
-        self._ports: list[OutputPort] = []
+        self.ports: list[OutputPort] = []
         for port, writer in self.writers.items():
             sources = [inputs.readers[name] for name in writer.spec.rests_on]
             output = OutputPort(segment, writer, alarms, sources, port in sent)
-            self._ports.append(output)
+            self.ports.append(output)
             level.store_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.read_queue_position(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)]
+        self._compiled = [port for port in self.ports if can_write(port.writer)]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
-        self._others = [port for port in self._ports if not can_write(port.writer)]
+        self._others = [port for port in self.ports if not can_write(port.writer)]
         self._is_faulty = False
 
     def open_writer(self, segment: Segment, name: str) -> Writer:
@@ -320,9 +325,9 @@ class OutputPorts:
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Set the active faults of all mailboxes. Each port applies those that concern it."""
-        for port in self._ports:
+        for port in self.ports:
             port.apply_faults(faults)
-        self._is_faulty = any(port.is_faulty for port in self._ports)
+        self._is_faulty = any(port.is_faulty for port in self.ports)
 
     @property
     def bus_errors(self) -> int:
@@ -339,7 +344,7 @@ class OutputPorts:
         Returns:
             False if a message was published too late.
         """
-        ports = self._ports
+        ports = self.ports
         if now is None and not self._is_faulty:
             ports = self._others
             if self._table.write(tick):
@@ -350,12 +355,12 @@ class OutputPorts:
             if not port.write(tick, now):
                 in_time = False
         if self._is_faulty:
-            self._is_faulty = any(port.is_faulty for port in self._ports)
+            self._is_faulty = any(port.is_faulty for port in self.ports)
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due. Call this in a cycle that writes nothing else."""
-        for port in self._ports:
+        for port in self.ports:
             port.flush_delayed(tick, now)
 
     @property

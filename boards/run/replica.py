@@ -29,7 +29,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Box, HandOver, Run, Slot, System
 from rack.boards.run.control_loop import VirtualControlLoop
-from rack.boards.run.ports import OutputPorts
+from rack.boards.run.ports import OutputPort, OutputPorts
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor
 
@@ -70,7 +70,7 @@ class ReplicatedOutputs(OutputPorts):
             tick: Release tick of the last cycle.
             now: Current tick. None if the messages are known to be in time.
         """
-        for port in self._ports:
+        for port in self.ports:
             slots = port.writer.slots
             head = slots.box[Box.HEAD]
             is_published = slots.has_message(head) and (
@@ -81,17 +81,30 @@ class ReplicatedOutputs(OutputPorts):
 
 
 class PublishedOutput:
-    """Read access to the messages that the active copy has written to one mailbox."""
+    """Read access to the messages that the active copy has written to one mailbox.
 
-    def __init__(self, segment: Segment, writer: Writer) -> None:
-        self.writer = writer
-        self._spec: MailboxSpec = writer.spec
-        self.slots = Slots(segment, writer.spec)
+    Attributes:
+        writer: Writer of this copy.
+        slots: Slots of the mailbox.
+        held: Message that this copy has held back in its last cycle.
+    """
+
+    def __init__(self, segment: Segment, port: OutputPort) -> None:
+        self.writer = port.writer
+        self._port = port
+        self._spec: MailboxSpec = port.writer.spec
+        self.slots = Slots(segment, self._spec)
+        self.held: bytes | memoryview = self.writer.message.raw
 
     def is_due(self, tick: int) -> bool:
         """Return True if the cycle released at `tick` writes this mailbox."""
         spec = self._spec
         return (tick + spec.lead_ticks - spec.phase) % spec.every == 0
+
+    def hold_message(self, tick: int) -> None:
+        """Hold back the message of the cycle released at `tick`."""
+        if self.is_due(tick):
+            self.held = self._port.find_content(tick)
 
     def fetch_message(self, tick: int) -> bool:
         """Copy the message of the cycle released at `tick`. Return False if there is none."""
@@ -105,7 +118,7 @@ class PublishedOutput:
     def find_difference(self) -> str:
         """Return the first field in which the copied message differs. Empty if none does."""
         theirs = self.slots.record[SLOT_HEAD_SIZE:]
-        ours = self.writer.message.raw
+        ours = self.held
         if theirs == ours:
             return ""
         fields = self._spec.fields
@@ -152,7 +165,8 @@ class Replica:
         self._lock = ByteLock(segment.fd, segment.map.blocks[spec.board] + 8 * Block.ACTIVE)
         self._is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._published: Mapping[str, PublishedOutput] = {
-            port: PublishedOutput(segment, writer) for port, writer in outputs.writers.items()
+            name: PublishedOutput(segment, port)
+            for name, port in zip(outputs.writers, outputs.ports, strict=True)
         }
         self._block[Block.ALIGNED] = 0
         self._ballot: Ballot | None = None
@@ -208,9 +222,11 @@ class Replica:
         if self.is_active and all(writer.holds_claim for writer in self._writers):
             return True
         self.held_tick = tick
+        for output in self._published.values():
+            output.hold_message(tick)
         if self._ballot is not None:
             due = self._list_due(tick)
-            self._ballot.cast_vote(tick, (output.writer.message.raw for output in due))
+            self._ballot.cast_vote(tick, (output.held for output in due))
         return False
 
     def serve_request(self) -> bool:

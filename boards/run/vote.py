@@ -17,7 +17,7 @@ from rack.backplane.words import Block
 _SIGN = 1 << 63
 
 
-def compute_checksum(messages: Iterable[memoryview]) -> int:
+def compute_checksum(messages: Iterable[bytes | memoryview]) -> int:
     """Return a checksum of messages as a signed word."""
     checksum = xxh3_64()
     for message in messages:
@@ -40,7 +40,7 @@ class Ballot:
         self._every = every
         self._checksum = 0
 
-    def cast_vote(self, tick: int, messages: Iterable[memoryview]) -> None:
+    def cast_vote(self, tick: int, messages: Iterable[bytes | memoryview]) -> None:
         """Store the checksum of the messages held back in the cycle released at `tick`."""
         self._checksum = compute_checksum(messages)
         block = self._blocks[self._number]

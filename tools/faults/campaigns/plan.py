@@ -143,6 +143,8 @@ class Targets:
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
+        # Only boards whose copies are compared can find a wrong output.
+        self._compared = {name for name, b in config.board.items() if b.compare or b.vote}
         self._roles = {task.name: task.role for task in layout.tasks}
         self._driving = {name: kind.faults for name, kind in find_executors(config).items()}
         self.by_kind = {kind.name: self._find_targets(kind) for kind in KINDS}
@@ -185,6 +187,8 @@ class Targets:
         if role is None or not box.readers:
             return False
         if kind.where == "lock" and box.protocol != "lock":
+            return False
+        if kind.where == "copy" and box.writer not in self._compared:
             return False
         # A queue is written on demand. The position of its reader is not written through a port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position_mailbox(box)):
