@@ -279,8 +279,8 @@ KINDS.add(
                 "1",
                 "number to add to the field, in its unit, instead of flipping a bit",
                 0,
-                -1e9,
-                1e9,
+                -1e6,
+                1e6,
             ),
         ),
         # Only a comparison with another copy can find it.
