@@ -127,8 +127,6 @@ def campaign(
     if faultless is None:
         # Skip faultless runs in real time if the user wants only lockstep, or only some faults.
         faultless = 0.0 if lockstep or is_special else FAULTLESS_S
-    if kills:
-        injections = 0
     if sizes is None:
         sizes = 0 if is_special or realtime else SIZES
     modes = (lockstep,) if lockstep or realtime else (True, False)
@@ -136,7 +134,7 @@ def campaign(
     order = Order(
         name=config,
         config=rack_config,
-        injections=injections,
+        injections=0 if kills else injections,
         seed=seed,
         modes=modes,
         kinds=kinds,

@@ -20,7 +20,13 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document, Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
-from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
+from rack.tools.faults.campaigns.draw import (
+    MAX_FAULTS,
+    RackUnderTest,
+    fault_plans,
+    kill_plans,
+    size_plans,
+)
 from rack.tools.faults.campaigns.environment import check_violation_counter, run_load
 from rack.tools.faults.campaigns.plan import (
     Plan,
@@ -106,7 +112,9 @@ class Campaign:
         self.folder = folder
         self._progress = progress
         # Drop the config's faults, which would act in every trial. Permit any number of misses.
-        unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
+        # All faults of a trial may strike one board, which is restarted each time.
+        permitted = {"max_missed_fraction": 1.0} | ({"restarts": MAX_FAULTS} if order.board else {})
+        unjudged = order.config.supervision.model_copy(update=permitted)
         self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
         self.layout: Layout = resolve_layout(self._config)
         self._second = 1e9 / self._config.clock_ns
