@@ -13,7 +13,8 @@ import fcntl
 import os
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from weakref import WeakSet
 
 _HELD: set[ProcessLock] = set()
@@ -135,6 +136,24 @@ def is_locked(fd: int, address: int) -> bool:
     request = _pack_lock_request(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, request))[0]
     return kind != fcntl.F_UNLCK
+
+
+def holds_lock(pid: int, fd: int, address: int) -> bool:
+    """Check whether a process holds the lock on a byte. False if its files cannot be examined.
+
+    Args:
+        pid: The process.
+        fd: Descriptor of the segment.
+        address: Bus address of the byte.
+    """
+    place = [str(os.fstat(fd).st_ino), str(address), str(address)]
+    texts = []
+    with suppress(OSError):
+        for path in Path(f"/proc/{pid}/fdinfo").iterdir():
+            texts.append(path.read_text())
+    # A line ends with device, inode, first byte and last byte: "lock: ... 00:1b:68789 8 8".
+    lines = (line.replace(":", " ").split() for text in texts for line in text.splitlines())
+    return any(words[:1] == ["lock"] and words[-3:] == place for words in lines)
 
 
 def _pack_lock_request(kind: int, address: int) -> bytes:

@@ -303,6 +303,10 @@ class Layout:
         standbys = (s for s in self.tasks if s.role == "standby" and s.board == spec.name)
         return (spec, *standbys)
 
+    def find_first_copy(self, task: str) -> str:
+        """Return the name of the task of which a task is a standby, otherwise its own name."""
+        return next((s.board for s in self.tasks if (s.name, s.role) == (task, "standby")), task)
+
     def find_pacers(self, host: TaskSpec) -> set[str]:
         """Return the bus adapters that share a mailbox with a host board.
 

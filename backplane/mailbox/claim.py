@@ -51,23 +51,24 @@ class MailboxClaim:
             pid = self._box[Box.WRITER_PID]
             self._lock.close()
             raise MailboxError(f"mailbox '{self._name}' already has a writer (process {pid})")
-        return self.begin_epoch()
+        head = self._box[Box.HEAD]
+        self.begin_epoch(head)
+        return head
 
     def try_lock(self) -> bool:
         """Take the kernel's lock, unless another process holds it."""
         self.is_locked = self.is_locked or self._lock.take()
         return self.is_locked
 
-    def begin_epoch(self) -> int:
+    def begin_epoch(self, head: int) -> None:
         """Enter this process in the head of the mailbox as its writer.
 
-        Returns:
-            Serial of the newest message of the previous writer.
+        Args:
+            head: Serial of the newest message of the previous writer.
         """
         box = self._box
-        epoch = get_epoch(box[Box.EPOCH] + 1)
-        # A previous writer that was stopped may store this word again at any time, so load it once.
-        head = box[Box.HEAD]
+        # A process that was killed before it stored its claim has used no epoch.
+        epoch = get_epoch(box[Box.CLAIMANT] + 1)
         box[Box.BEGUN + epoch % Box.EPOCHS] = head
         # A reader that finds the new claim must find the word that belongs to it.
         self._slots.fence()
@@ -80,7 +81,6 @@ class MailboxClaim:
         self._slots.signature = signature
         self._slots.chain = chain
         self.is_taken = True
-        return head
 
     @property
     def is_valid(self) -> bool:

@@ -63,13 +63,12 @@ class MailboxRing(Ring):
         if not len(rows):
             return NewRows(rows, lost)
         serials = np.arange(self._taken - len(rows), self._taken) + 1
-        holder = self._box[Box.CLAIMANT]
+        holder, begun = self._read_claim()
         signatures = rows["epoch"]
         epochs = signatures & EPOCH_MASK
         newest = get_epoch(holder)
         # As in `Slots.is_from_claimant`.
         following = np.maximum(epochs + 1, newest - Box.EPOCHS + 1) % Box.EPOCHS
-        begun = np.array(self._box[Box.BEGUN : Box.BEGUN + Box.EPOCHS])
         lawful = (signatures == holder) | ((epochs < newest) & (serials <= begun[following]))
         if not lawful[-1]:
             # The newest message is forged. The true writer will overwrite it with its next message,
@@ -88,6 +87,14 @@ class MailboxRing(Ring):
         if not good.all():
             rows = rows[good]
         return NewRows(rows, lost)
+
+    def _read_claim(self) -> tuple[int, np.ndarray]:
+        """Return the signature of the writer, and the words `Box.BEGUN` that belong to it."""
+        while True:
+            holder = self._box[Box.CLAIMANT]
+            begun = np.array(self._box[Box.BEGUN : Box.BEGUN + Box.EPOCHS])
+            if self._box[Box.CLAIMANT] == holder:
+                return holder, begun
 
 
 def build_row_dtype(spec: MailboxSpec) -> np.dtype:

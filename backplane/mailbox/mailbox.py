@@ -115,13 +115,15 @@ class Writer:
             self._continue_after(self.claim.take())
 
     def take_over(self) -> None:
-        """MailboxClaim the mailbox in a new epoch, even if the process of its writer is alive.
+        """Claim the mailbox in a new epoch, even if the process of its writer is alive.
 
         Readers reject what that process publishes from now on. Only a standby may call this, while
         it holds the lock on the hand-over: see `rack.backplane.standby`.
         """
         self.claim.try_lock()
-        self._continue_after(self.claim.begin_epoch())
+        head = self.slots.find_newest()
+        self.claim.begin_epoch(head)
+        self._continue_after(head)
 
     def _continue_after(self, head: int) -> None:
         """Continue after the newest message of the previous writer, which has this serial."""

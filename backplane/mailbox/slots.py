@@ -185,6 +185,22 @@ class Slots:
                 self.chain = (words[_CHECK] & UNSIGNED) ^ (words[_EPOCH] & EPOCH_MASK)
                 break
 
+    def find_newest(self) -> int:
+        """Return the serial of the newest message that lawful writers have published.
+
+        It differs from the head if a writer that was stopped and replaced has published since. That
+        writer sets the head at most to the first serial of its successor.
+        """
+        claimant = self.box[Box.CLAIMANT]
+        begun = self.box[Box.BEGUN + get_epoch(claimant) % Box.EPOCHS]
+        # A stopped writer may store this word at any time, so load it once.
+        head = max(self.box[Box.HEAD], begun)
+        own = (words[_SERIAL] for words in self.heads if words[_EPOCH] == claimant)
+        newest = max(own, default=begun)
+        is_set_back = newest > head + 1
+        is_set_ahead = newest == begun == head - 1
+        return newest if is_set_back or is_set_ahead else head
+
     def clear_unpublished(self, head: int) -> None:
         """Clear the serials of slots that a dead writer has filled but not published.
 
@@ -313,4 +329,9 @@ class Slots:
             return False
         # Epochs that began too long ago have no word any more. The oldest word is a bound for them.
         following = max(epoch + 1, newest - Box.EPOCHS + 1)
-        return epoch < newest and self.serial <= self.box[Box.BEGUN + following % Box.EPOCHS]
+        begun = self.box[Box.BEGUN + following % Box.EPOCHS]
+        self.fence()
+        if self.box[Box.CLAIMANT] != holder:
+            # Later claims may have replaced the word.
+            return self.is_from_claimant(known)
+        return epoch < newest and self.serial <= begun

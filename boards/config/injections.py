@@ -207,7 +207,8 @@ class FaultCheck:
         written = {
             m.name: m
             for m in layout.mailboxes
-            if m.writer == board and (kind.where == "bus" or not is_position_mailbox(m))
+            if m.writer == layout.find_first_copy(board)
+            and (kind.where == "bus" or not is_position_mailbox(m))
         }
         struck = [m for m in written.values() if mailbox in (None, m.name)]
         if mailbox is not None and not struck:
@@ -216,9 +217,12 @@ class FaultCheck:
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
         # Boards that are missing from the layout may read the mailbox.
-        if kind.where == "bus" and mailbox is None and not self.broken_boards:
+        if kind.takes_one_mailbox and mailbox is None and not self.broken_boards:
             has_reader = any(m.readers for m in struck)
             return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
+        number = self.fault.parameters.get("field", -1)
+        if kind.where == "copy" and any(number >= len(m.fields) for m in struck):
+            return f"'{struck[0].name}' has no field {number:g}; it has {len(struck[0].fields)}"
         locked = [m.name for m in written.values() if m.protocol == "lock"]
         if kind.where == "lock" and (not locked or mailbox not in (None, *locked)):
             why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
@@ -290,12 +294,11 @@ def _build_injection(
     mailbox = -1
     if fault.mailbox is not None:
         mailbox = layout.find_mailbox_index(fault.mailbox)
-    elif kind.where == "bus":
-        # A forged message enters one mailbox, by default the first that has a reader.
+    elif kind.takes_one_mailbox:
         mailbox = next(
             at
             for at, box in enumerate(layout.mailboxes)
-            if box.writer == fault.board and box.readers
+            if box.writer == layout.find_first_copy(fault.board) and box.readers
         )
     seed = fault.seed
     if seed is None:

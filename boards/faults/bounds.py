@@ -61,7 +61,8 @@ def list_affected_mailboxes(layout: Layout, index: int, board: str) -> tuple[Mai
         board: Name of the task. Mailboxes that the task does not write are left out.
     """
     chosen = layout.mailboxes if index < 0 else layout.mailboxes[index : index + 1]
-    return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
+    writer = layout.find_first_copy(board)
+    return tuple(mailbox for mailbox in chosen if mailbox.writer == writer)
 
 
 def compute_read_interval(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:

@@ -10,6 +10,7 @@ from rack.backplane.checked import select_item, to_enum, to_integer
 from rack.backplane.fault_table import NEVER, FaultEntry, Stage
 from rack.backplane.layout import Layout
 from rack.boards.faults.kind import find_kind
+from rack.boards.faults.message_steps import describe_wrong_value
 
 ALL_JOINTS = "all joints"
 
@@ -90,9 +91,14 @@ def describe_fault(
     kind = find_kind(entry)
     target = f" of {find_board(entry, layout)}" if with_board else ""
     details = [find_subject(entry, layout, joints)]
-    for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
-        if parameter.name != "joint":
-            unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
-            details.append(f"{parameter.name} {value:g}{unit}")
+    if kind.where == "copy":
+        # Name the field and the bit, which may be drawn.
+        spec = select_item(layout.mailboxes, entry.mailbox, "mailbox")
+        details[0] += f".{describe_wrong_value(entry, spec)}"
+    else:
+        for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
+            if parameter.name != "joint":
+                unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
+                details.append(f"{parameter.name} {value:g}{unit}")
     detail_text = ", ".join(text for text in details if text)
     return f"{kind.name}{target}" + f" ({detail_text})" * bool(detail_text)

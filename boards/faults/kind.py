@@ -31,11 +31,12 @@ from rack.boards.faults.bounds import (
 )
 from rack.boards.faults.drawing import Draw, DrawTicks
 
-Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
+Where = Literal["process", "load", "core", "writer", "copy", "bus", "lock", "clock", "arm", "start"]
 """Process in which a step acts, and when.
 
 - `process`, `clock`, `bus`: in the clock's board, at the start of a tick.
 - `load`, `writer`, `lock`: in the task itself.
+- `copy`: in the task itself, also while it is a standby that holds its messages back.
 - `core`: in a separate process on the task's core. In lockstep, in each task of that core.
 - `arm`: in the level that drives the arm.
 - `start`: in the board as it starts.
@@ -148,12 +149,17 @@ class Kind:
     @property
     def takes_mailbox(self) -> bool:
         """Whether the fault affects messages, in one mailbox or in all that the task writes."""
-        return self.where in ("writer", "bus", "lock")
+        return self.where in ("writer", "copy", "bus", "lock")
+
+    @property
+    def takes_one_mailbox(self) -> bool:
+        """Whether it affects a single mailbox, by default the first of its task with a reader."""
+        return self.where in ("copy", "bus")
 
     @property
     def acts_in_task(self) -> bool:
         """Whether the fault acts in the task's own process, during its cycles."""
-        return self.where in ("load", "writer", "lock", "arm")
+        return self.where in ("load", "writer", "copy", "lock", "arm")
 
     @property
     def ends_when_detected(self) -> bool:

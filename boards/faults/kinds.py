@@ -249,6 +249,48 @@ KINDS.add(
         consequence=DAMAGE,
         lasts=draw.uniform_messages(4, 8),
     ),
+    Kind(
+        name="wrong-output",
+        where="copy",
+        means="one copy of a task computes a wrong value",
+        step=messages.WrongOutput,
+        tasks=("executor",),
+        parameters=(
+            Parameter(
+                "field",
+                "1",
+                "index of the wrong field in the message (-1: drawn from the seed)",
+                -1,
+                -1,
+                1000,
+                is_whole=True,
+            ),
+            Parameter(
+                "bit",
+                "1",
+                "bit of the field to flip, modulo its size (-1: drawn from the seed)",
+                -1,
+                -1,
+                1e6,
+                is_whole=True,
+            ),
+            Parameter(
+                "offset",
+                "1",
+                "number to add to the field, in its unit, instead of flipping a bit",
+                0,
+                -1e6,
+                1e6,
+            ),
+        ),
+        # Only a comparison with another copy can find it.
+        detected_as=(Alarm.DIFFERS, Alarm.STRAYED),
+        not_queued="a level with a queue has no standby, so nothing would find it",
+        bound=bounds.cycle_bound(1) + bounds.tick_bound(1),
+        # A vote takes the copy out.
+        consequence=Consequence(ends_process=True),
+        lasts=draw.uniform_messages(1, 1),
+    ),
     _message(
         name="babble",
         means="the task floods its mailboxes",

@@ -13,7 +13,10 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, cast
 
+import numpy as np
+
 from rack.backplane.fault_table import FaultEntry
+from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import LockWriter
 from rack.backplane.mailbox.slots import Slots, build_signature
@@ -68,6 +71,10 @@ class MessageStep:
 
     def flush_due(self, tick: int, visible_at: int) -> None:
         """Pass on the delayed messages that are due at `tick`. Steps that delay none do nothing."""
+
+    def change_content(self, tick: int, content: bytes | memoryview) -> bytes | memoryview:
+        """Return the content of a message of the cycle released at `tick`, by default unchanged."""
+        return content
 
     def count_action(self, message: Outgoing) -> None:
         """Record in the fault table that the fault acted, in the cycle that writes the message."""
@@ -156,6 +163,50 @@ class Corrupt(MessageStep):
         self.onward(message)
 
 
+def choose_wrong_bit(entry: FaultEntry, spec: MailboxSpec) -> tuple[FieldSpec, int]:
+    """Return the field in which messages of a mailbox are wrong, and its bit to flip.
+
+    Both are drawn from the seed of the fault unless its parameters state them.
+    """
+    chance = random.Random(f"{entry.seed} {spec.name}")
+    fields = spec.fields
+    number, bit, *_ = map(int, entry.parameters)
+    field = fields[number] if 0 <= number < len(fields) else chance.choice(fields)
+    size = np.dtype((field.kind, field.shape)).itemsize * 8
+    return field, bit % size if bit >= 0 else chance.randrange(size)
+
+
+def describe_wrong_value(entry: FaultEntry, spec: MailboxSpec) -> str:
+    """Return the wrong field of a mailbox's messages, and what is wrong, as text."""
+    field, bit = choose_wrong_bit(entry, spec)
+    offset = entry.parameters[2]
+    return f"{field.name}, " + (f"offset {offset:g} {field.unit}" if offset else f"bit {bit}")
+
+
+class WrongOutput(MessageStep):
+    """Computes one field of each message wrongly. Readers cannot tell: the checksum is correct."""
+
+    def change_content(self, tick: int, content: bytes | memoryview) -> bytes:
+        """Flip a bit of the field or, if the fault has an offset, add it to each of its numbers."""
+        self.entry.record_action(tick)
+        changed = bytearray(content)
+        field, bit = choose_wrong_bit(self.entry, self.writer.spec)
+        kind = np.dtype(field.kind)
+        offset = self.entry.parameters[2]
+        if offset and kind.kind in "iuf":
+            count = int(np.prod(field.shape, dtype=int))
+            numbers = np.frombuffer(changed, kind, count, field.offset)
+            np.add(numbers, offset, out=numbers, casting="unsafe")
+        else:
+            changed[field.offset + (bit >> 3)] ^= 1 << (bit & 7)
+        return bytes(changed)
+
+    def send_message(self, message: Outgoing) -> None:
+        """Pass a wrong message on."""
+        content = message.content or self.writer.message.raw
+        self.onward(message._replace(content=bytes(self.change_content(message.at, content))))
+
+
 class Babble(MessageStep):
     """Writes each message many times."""
 
@@ -219,6 +270,13 @@ class FaultyWriter:
             step.onward = onward
             onward = step.send_message
         self._first = onward
+
+    def find_content(self, tick: int) -> bytes | memoryview:
+        """Return the message that a standby holds back in the cycle released at `tick`."""
+        content: bytes | memoryview = self._writer.message.raw
+        for step in self._steps.values():
+            content = step.change_content(tick, content)
+        return content
 
     @property
     def is_over(self) -> bool:

@@ -155,7 +155,7 @@ class TaskFaults:
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
-        self._apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
+        self._apply([entry for kind, entry in active if kind.where in ("writer", "copy", "lock")])
         arm_faults = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm_faults]
         if self._spec.role != "planner":

@@ -13,7 +13,7 @@ import signal
 import time
 from contextlib import suppress
 
-from rack.backplane.byte_lock import ProcessLock
+from rack.backplane.byte_lock import ProcessLock, holds_lock
 from rack.backplane.process import STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
@@ -37,20 +37,22 @@ def await_clock_lock(segment: Segment, is_standby: bool) -> ProcessLock:
     while is_standby and not words[System.CLOCK_PID] and words[System.STATE] != Run.STOPPED:
         time.sleep(POLL_S)
     while not lock.take():
-        _kill_stopped_clock(words[System.CLOCK_PID])
+        _kill_stopped_clock(segment)
         time.sleep(_compute_wait_s(words))
     return lock
 
 
-def _kill_stopped_clock(pid: int) -> None:
-    """Kill the clock's process if a signal has stopped it."""
+def _kill_stopped_clock(segment: Segment) -> None:
+    """Kill the clock's process if a signal has stopped it. Only that process has the lock."""
+    pid = segment.words[System.CLOCK_PID]
     if pid <= 0 or read_state(pid) not in STOPPED_STATES:
         return
     # The descriptor belongs to one process, whose number may be given to another one later.
     with suppress(ProcessLookupError):
         pidfd = os.pidfd_open(pid)
         try:
-            if read_state(pid) in STOPPED_STATES:
+            is_clock = holds_lock(pid, segment.fd, 8 * System.CLOCK_PID)
+            if is_clock and read_state(pid) in STOPPED_STATES:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
         finally:
             os.close(pidfd)

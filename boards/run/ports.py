@@ -213,6 +213,11 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.apply_faults(chosen)
 
+    def find_content(self, tick: int) -> bytes | memoryview:
+        """Return the message that a standby holds back in the cycle released at `tick`."""
+        faulty = self._faulty
+        return self.writer.message.raw if faulty is None else faulty.find_content(tick)
+
     @property
     def is_faulty(self) -> bool:
         """True if faults act on the mailbox, or delayed messages are still to be published."""

@@ -48,16 +48,27 @@ class ReplicatedOutputs(OutputPorts):
 
 
 class ReplicatedOutput:
-    """One output of a copy: the message that it holds back, and those of the active copy."""
+    """One output of a copy: the message that it holds back, and those of the active copy.
+
+    Attributes:
+        spec: The mailbox.
+        slots: Slots of the mailbox.
+        held: The message that this copy has held back in its last cycle.
+    """
 
     def __init__(self, segment: Segment, port: OutputPort) -> None:
         self._port = port
         self.spec = port.writer.spec
         self.slots = Slots(segment, self.spec)
+        self.held: bytes | memoryview = port.writer.message.raw
 
     def is_due(self, tick: int) -> bool:
         """Return True if the cycle released at `tick` writes this mailbox."""
         return (tick + self.spec.lead_ticks - self.spec.phase) % self.spec.every == 0
+
+    def hold_message(self, tick: int) -> None:
+        """Hold back the message of the cycle released at `tick`."""
+        self.held = self._port.find_content(tick)
 
     def fetch_message(self, tick: int) -> bool:
         """Copy the active copy's message of the cycle released at `tick`. False if it has none."""
@@ -69,20 +80,19 @@ class ReplicatedOutput:
         return False
 
     @property
-    def held(self) -> memoryview:
-        """The message that this copy holds back."""
-        return self._port.writer.message.raw
-
-    @property
     def published(self) -> memoryview:
         """The fetched message."""
         return self.slots.record[SLOT_HEAD_SIZE:]
 
     def find_difference(self) -> str:
         """Return the first field in which the fetched message differs from the one held back."""
-        ours, theirs = self._port.writer.message.record, self.slots.message.record
-        names = [field.name for field in self.spec.fields]
-        return next((n for n in names if ours[n].tobytes() != theirs[n].tobytes()), names[-1])
+        fields = self.spec.fields
+        ends = (*(field.offset for field in fields[1:]), self.spec.size)
+        return next(
+            field.name
+            for field, end in zip(fields, ends, strict=True)
+            if self.held[field.offset : end] != self.published[field.offset : end]
+        )
 
     def publish_held(self, tick: int, now: int | None) -> None:
         """Publish the message of the cycle released at `tick` unless a copy has published it.
@@ -281,9 +291,12 @@ class ReplicatedLoop(VirtualControlLoop):
         if self.is_active and all(writer.claim.is_valid for writer in self._writers):
             return self._write(tick, now)
         self._held_tick = tick
+        due = self._list_due(tick)
+        for output in due:
+            output.hold_message(tick)
         if self._votes:
-            held = (output.held for output in self._list_due(tick))
-            self.block[self._find_vote_word(tick)] = compute_vote(tick, held)
+            vote = compute_vote(tick, (output.held for output in due))
+            self.block[self._find_vote_word(tick)] = vote
         return True
 
     def _take_over(self, tick: int, reason: HandOver) -> bool:
@@ -326,6 +339,6 @@ class ReplicatedLoop(VirtualControlLoop):
         super()._report_findings(tick)
 
 
-def compute_vote(tick: int, messages: Iterable[memoryview]) -> int:
+def compute_vote(tick: int, messages: Iterable[bytes | memoryview]) -> int:
     """Return a checksum of the messages of a cycle, 63 bits. It depends on the tick too."""
     return xxh3_64_intdigest(b"".join(messages), tick) >> 1

@@ -21,6 +21,9 @@ FOLLOWED = PLANNED.replace(
     f'executor = "fault_levels:Follower"\nparams = {{ patience = {PATIENCE_TICKS} }}',
 )
 LOCKED = "protocol.default=lock"
+COMPARED = ("board.wave.standby={slot=9,core=0}", "board.wave.compare=true")
+OF_KINDS = {"lock": (LOCKED,), "copy": COMPARED}
+"""Settings of the rack by the kind's `where`."""
 TARGETS = {"overrun": "wave", "planner-slow": "wave.planner", "clock": "clock", "arm": "driven"}
 """A task to strike, by kind or by the kind's `where`; for all others it is the wave."""
 

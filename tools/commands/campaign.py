@@ -39,6 +39,10 @@ def campaign(
     kills: int | None = option(
         "--kills N", "instead: only N kills from outside", min=1, max=MAX_COUNT
     ),
+    standby: str | None = option(
+        "--standby BOARD",
+        "instead: faults of this board only, without a standby and with one, side by side",
+    ),
     lockstep: bool = option("--lockstep", "trials in lockstep only; default: both", False),
     realtime: bool = option("--realtime", "trials in real time only; default: both", False),
     faultless: float | None = option(
@@ -80,6 +84,9 @@ def campaign(
     includes runs without faults in real time, alone and under load. To continue an interrupted
     campaign, give the same --out.
 
+    --standby BOARD injects faults into one board, first without a standby and then with one, and
+    compares its output. A config that gives the board no standby gets one for the second half.
+
     Exit status: 0 the campaign passed; 1 a fault had no effect, or was not detected, handled and
     recovered from in time; a limit was violated; a process or segment was left behind; a task was
     neither done nor safely stopped; or a detection had no fault; 2 usage or config error.
@@ -89,39 +96,45 @@ def campaign(
       rack campaign nasrem
       rack campaign nasrem --kinds kill,mute --injections 20 --lockstep
       rack campaign nasrem --kills 100 --out runs/kills
+      rack campaign nasrem --standby servo --kinds kill --injections 500 --lockstep
     """
     from rack.boards.config import load as load_config
     from rack.tools.console.interrupt import INTERRUPT
     from rack.tools.console.progress import open_progress
-    from rack.tools.faults.campaigns.campaign import ORDER, Campaign, Order
+    from rack.tools.faults.campaigns.campaign import ORDER, Order, run_campaign
+    from rack.tools.faults.campaigns.comparison import (
+        WITHOUT,
+        build_comparison,
+        compare_campaigns,
+        list_standby_settings,
+    )
     from rack.tools.launch.folder import choose_run_folder
 
     if lockstep and realtime:
         raise Failure(
             "--lockstep and --realtime exclude each other; give one, or neither for both", 2
         )
-    if kills is not None and kinds is not None:
-        raise Failure(
-            f"--kills {kills} and --kinds {kinds} exclude each other: kills from outside are not a"
-            " kind of fault; give one",
-            2,
-        )
+    for name, value in {"kinds": kinds, "standby": standby}.items():
+        if kills is not None and value is not None:
+            why = "kills from outside are not a kind of fault and strike all boards; give one"
+            raise Failure(f"--kills {kills} and --{name} {value} exclude each other: {why}", 2)
     rack_config = load_config(config, settings)
+    if standby is not None:
+        rack_config = load_config(config, [*settings, *list_standby_settings(rack_config, standby)])
     if seconds is None and not any(board.ends_run for board in rack_config.board.values()):
         raise Failure(f"{config}: no board ends the run; give its simulated time with --seconds", 2)
+    is_special = kills is not None or standby is not None
     if faultless is None:
-        # Skip faultless runs in real time if the user wants only lockstep, or only kills.
-        faultless = 0.0 if lockstep or kills is not None else FAULTLESS_S
-    if kills:
-        injections = 0
+        # Skip faultless runs in real time if the user wants only lockstep, or only some faults.
+        faultless = 0.0 if lockstep or is_special else FAULTLESS_S
     if sizes is None:
-        sizes = 0 if kills or realtime else SIZES
+        sizes = 0 if is_special or realtime else SIZES
     modes = (lockstep,) if lockstep or realtime else (True, False)
     loads = (True,) if load else (False, True)
     order = Order(
         name=config,
         config=rack_config,
-        injections=injections,
+        injections=0 if kills else injections,
         seed=seed,
         modes=modes,
         kinds=kinds,
@@ -130,17 +143,24 @@ def campaign(
         faultless_s=faultless,
         loads=loads,
         seconds=seconds,
+        board=standby or "",
     )
-    started = time.monotonic()
     # An existing campaign is continued in its folder.
-    folder = (
-        out if out is not None and (out / ORDER).is_file() else choose_run_folder(out, "campaign")
-    )
+    part = "" if standby is None else WITHOUT
+    is_begun = out is not None and (out / part / ORDER).is_file()
+    folder = out if out is not None and is_begun else choose_run_folder(out, "campaign")
     with INTERRUPT.stop_orderly(unfinished=NO_TIME.format(folder)):
         with open_progress(silent=as_json) as progress:
-            work = Campaign(order, folder, progress, whole)
-            results = work.run()
-        report, text = _write_report(work, results, time.monotonic() - started)
+            started = time.monotonic()
+            run = run_campaign if standby is None else compare_campaigns
+            pairs = run(order, folder, progress, whole)
+        wall_s = time.monotonic() - started
+        reports = [_write_report(work, results, wall_s) for work, results in pairs]
+        report, text = reports[0]
+        if standby is not None:
+            report, text = build_comparison([results for _, results in pairs], reports)
+            write_json(folder / "comparison.json", report)
+            (folder / "comparison.md").write_text(text)
     picture_note = "" if can_draw() else f"; {NO_PICTURES}"
     print_json(report) if as_json else print(f"{text}\n{folder}/{picture_note}")
     if report["shortfalls"] or report["interrupted"]:

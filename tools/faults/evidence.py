@@ -23,11 +23,12 @@ def _to_codes(alarms: Iterable[Alarm]) -> set[str]:
 
 DETECTION_KINDS = ("detection", "miss", DIED)
 """Kinds of events that can count as detections."""
+DIFFERS = Alarm.DIFFERS.name.lower()
 MAILBOX_ALARMS = _to_codes(alarm for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL)
 CLOCK_ALARMS = _to_codes(
     alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE
 )
-TASK_ALARMS = _to_codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
+TASK_ALARMS = _to_codes((Alarm.STRAYED, Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
 BRAKES = "brakes_closed"
 LATCHED = "latched"
 """Code of the reaction to a fault that lasted too long: brakes stay closed and the task ends."""
@@ -111,7 +112,7 @@ def concerns_target(event: Event, strike: Strike) -> bool:
     """Return True if an event concerns the target of a fault: its mailboxes, task or joint."""
     if event.code == DIED:
         return event.board == strike.board
-    if event.code in MAILBOX_ALARMS:
+    if event.code in MAILBOX_ALARMS or event.code == DIFFERS:
         return event.subject in strike.mailboxes
     if event.code in TASK_ALARMS:
         return event.subject == strike.board

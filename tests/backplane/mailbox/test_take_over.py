@@ -3,10 +3,6 @@ no reader gets a message of the one before."""
 
 from __future__ import annotations
 
-import os
-import signal
-from typing import Any
-
 import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
@@ -15,6 +11,7 @@ from rack.backplane.mailbox.protocols import open_reader, open_standby_writer, o
 from rack.backplane.words import Box
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
+from tests.backplane.mailbox.mines import Bomb, mine
 from tests.processes import FORKS, exit_status, fork
 
 NEW, OLD = Verdict.NEW, Verdict.OLD
@@ -93,55 +90,77 @@ def test_what_a_stopped_writer_still_stores_is_never_accepted(
     assert reader.statistics.corrupt == 0
 
 
-class Bomb:
-    """Kills this process at an access to shared memory, by its number."""
-
-    def __init__(self, number: int) -> None:
-        self.left = number
-
-    def count(self) -> None:
-        if not self.left:
-            os.kill(os.getpid(), signal.SIGKILL)
-        self.left -= 1
-
-
-class MinedBox:
-    """Words of the head of a mailbox, each store of which counts."""
-
-    def __init__(self, words: memoryview, bomb: Bomb) -> None:
-        self._words, self._bomb = words, bomb
-
-    def __getitem__(self, at: Any) -> Any:
-        return self._words[at]
-
-    def __setitem__(self, at: int, value: int) -> None:
-        self._bomb.count()
-        self._words[at] = value
+@pytest.mark.parametrize("first_continues", [2, 3], ids=["before third", "after third"])
+def test_what_two_stopped_writers_still_store_is_never_accepted(
+    make_bus: MakeBus, first_continues: int
+) -> None:
+    """The first one sets the head, so that the message of the second looks as if published."""
+    segment = make_bus(mailbox(depth=4))
+    writers = [open_writer(segment, NAME), *(open_standby_writer(segment, NAME) for _ in range(3))]
+    reader, ring = open_reader(segment, NAME), MailboxRing(segment, NAME)
+    write(writers[0], 0, 1)
+    assert read(reader, 1) == (1, NEW)
+    for number in (1, 2, 3):
+        if number == first_continues:
+            write(writers[0], 1, 98)
+        writers[number].take_over()
+        if number == 2:
+            write(writers[1], 1, 99)
+        assert read(reader, 2) == (1, OLD)
+        assert not {98, 99} & {int(row["message"]["row"][0]) for row in ring.read_new_rows().rows}
+    write(writers[3], 2, 50)
+    assert read(reader, 3) == (50, NEW)
 
 
-class MinedSlot:
-    """A slot into which every word is stored alone, in an order of the bomb's choice."""
+@pytest.mark.parametrize("is_written_again", [False, True])
+def test_a_head_that_a_stopped_writer_has_set_back_loses_no_message(
+    make_bus: MakeBus, is_written_again: bool
+) -> None:
+    segment = make_bus(mailbox(depth=4))
+    first, second, third = (
+        open_writer(segment, NAME),
+        open_standby_writer(segment, NAME),
+        open_standby_writer(segment, NAME),
+    )
+    reader = open_reader(segment, NAME)
+    write(first, 0, 1)
+    second.take_over()
+    for tick in range(1, 7):
+        write(second, tick, 1 + tick)
+    write(first, 1, 99)
+    if is_written_again:
+        write(second, 7, 8)
+    third.take_over()
+    write(third, 8, 9)
+    assert read(reader, 9) == (9, NEW)
+    assert reader.serial == 8 + is_written_again
 
-    def __init__(self, place: memoryview, bomb: Bomb) -> None:
-        self._place, self._bomb = place, bomb
 
-    def __getitem__(self, part: slice) -> memoryview:
-        return self._place[part]
+@pytest.mark.filterwarnings(FORKS)
+def test_a_standby_that_dies_in_its_claim_takes_no_message_from_the_active_copy(
+    make_bus: MakeBus,
+) -> None:
+    names = [f"writer.point{number}" for number in range(6)]
+    segment = make_bus(*(mailbox(depth=4, name=name) for name in names))
+    for number, name in enumerate(names):
+        first = open_writer(segment, name)
+        second, third = (open_standby_writer(segment, name) for _ in range(2))
+        reader = open_reader(segment, name)
+        write(first, 0, 1)
+        assert read(reader, 1) == (1, NEW)
 
-    def __setitem__(self, part: slice, content: Any) -> None:
-        view = self._place[part]
-        for at in range(0, len(view), 8):
-            self._bomb.count()
-            view[at : at + 8] = content[at : at + 8]
+        def take_over(second: Writer = second, number: int = number) -> None:
+            mine(second, Bomb(number))
+            second.take_over()
 
-
-def mine(writer: Writer, bomb: Bomb) -> None:
-    """Let every store of a writer to shared memory count."""
-    slots: Any = writer.slots
-    slots.box = MinedBox(slots.box, bomb)
-    writer.claim._box = MinedBox(writer.claim._box, bomb)  # type: ignore[assignment]
-    slots.places = [MinedSlot(place, bomb) for place in slots.places]
-    slots.heads = [MinedBox(words, bomb) for words in slots.heads]
+        is_dead = exit_status(fork(take_over)) != 0
+        assert is_dead == (number < 4)
+        if is_dead:
+            write(first, 1, 2)
+            third.take_over()
+            assert read(reader, 3) == (2, NEW), number
+        for writer in (first, second, third):
+            writer.close()
 
 
 MOST_STORES = 100

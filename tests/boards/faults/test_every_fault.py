@@ -19,7 +19,7 @@ from rack.boards.errors import LaunchError
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
+from tests.boards.fault_racks import FOLLOWED, LOCKED, OF_KINDS, PATIENCE_TICKS, TARGETS
 from tests.boards.runs import faulty
 from tests.processes import BOUND_S, wait_until
 
@@ -49,7 +49,7 @@ def rack_with(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> Rack:
     """Return a rack whose wave, or what else the kind strikes, has the fault."""
     board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
     settings = ["clock.mode=realtime"] if kind.realtime else []
-    found = config(*settings, *([LOCKED] if kind.where == "lock" else []), text=FOLLOWED)
+    found = config(*settings, *OF_KINDS.get(kind.where, ()), text=FOLLOWED)
     tick = {} if kind.where == "start" else {"tick": FIRST}
     return Rack(faulty(found, {"kind": kind.name, "board": board, **tick, **length}))
 

@@ -9,7 +9,7 @@ import pytest
 from rack.boards import Rack
 from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import LOOSE, MakeConfig
-from tests.boards.fault_racks import DRIVEN, FOLLOWED, LOCKED, TARGETS
+from tests.boards.fault_racks import DRIVEN, FOLLOWED, OF_KINDS, TARGETS
 from tests.boards.runs import faulty
 from tests.snapshots import Snapshots
 from tests.whole_runs import in_short, whole_run
@@ -52,7 +52,7 @@ def test_a_fault_at_the_first_tick_acts_like_a_later_one(kind: str, config: Make
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
 def test_the_effect_of_each_fault_is_unchanged(kind: Kind, rack: str, config: MakeConfig) -> None:
-    settings = [LOCKED] if kind.where == "lock" else []
+    settings = OF_KINDS.get(kind.where, ())
     struck = faulty(config(*settings, text=RACKS[rack]), *faults(kind))
     parts = dict(whole_run(struck, SECONDS))
     if kind.name in BY_ORDER:

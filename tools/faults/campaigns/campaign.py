@@ -20,9 +20,21 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document, Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
-from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
+from rack.tools.faults.campaigns.draw import (
+    MAX_FAULTS,
+    RackUnderTest,
+    fault_plans,
+    kill_plans,
+    size_plans,
+)
 from rack.tools.faults.campaigns.environment import check_violation_counter, run_load
-from rack.tools.faults.campaigns.plan import Plan, Targets, needs_real_time, select_kinds
+from rack.tools.faults.campaigns.plan import (
+    Plan,
+    Targets,
+    needs_real_time,
+    select_kinds,
+    strike_active_copies,
+)
 from rack.tools.faults.campaigns.results import FaultlessTime, Results, TrialResult, load_result
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from rack.tools.faults.ending import EXTERNAL, find_record
@@ -60,6 +72,7 @@ class Order:
         faultless_s: Simulated time in s without faults, for each entry of `loads`.
         loads: Whether the machine is loaded, for each stretch of faultless time.
         seconds: Simulated time in s after which a run ends if no task ends it.
+        board: The only board that faults affect. Empty for all.
     """
 
     name: str
@@ -73,6 +86,7 @@ class Order:
     faultless_s: float = 0.0
     loads: tuple[bool, ...] = (False, True)
     seconds: float | None = None
+    board: str = ""
 
     def to_document(self) -> Document:
         """Return the specification as plain data. Equal campaigns have equal documents."""
@@ -98,11 +112,13 @@ class Campaign:
         self.folder = folder
         self._progress = progress
         # Drop the config's faults, which would act in every trial. Permit any number of misses.
-        unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
+        # All faults of a trial may strike one board, which is restarted each time.
+        permitted = {"max_missed_fraction": 1.0} | ({"restarts": MAX_FAULTS} if order.board else {})
+        unjudged = order.config.supervision.model_copy(update=permitted)
         self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
         self.layout: Layout = resolve_layout(self._config)
         self._second = 1e9 / self._config.clock_ns
-        self._targets = Targets(self._config, self.layout)
+        self._targets = Targets(self._config, self.layout, order.board)
         self.kinds = select_kinds(order.kinds, self._targets, False in order.modes)
         self._ticks = 0
         self._number = 0
@@ -183,9 +199,10 @@ class Campaign:
             seed = f"{order.seed} {turn}"
             draws = min(turn + 1, MAX_DRAWS)
             counts = {kind: lacking[kind] * (draws if kind in tried else 1) for kind in round_kinds}
-            results_of_round = self._run_plans(
-                fault_plans(rack, counts, seed, lockstep, self._number + 1)
-            )
+            plans = fault_plans(rack, counts, seed, lockstep, self._number + 1)
+            if order.board:
+                plans = strike_active_copies(plans, self.layout, order.board)
+            results_of_round = self._run_plans(plans)
             results.trials += results_of_round
             faults = [fault for run in results_of_round for fault in run.faults]
             lacking -= Counter(
@@ -286,6 +303,14 @@ class Campaign:
         lockstep_s = real_s / 3.0 / len(os.sched_getaffinity(0))
         run_s = {True: lockstep_s, False: real_s}
         return sum(LAUNCH_S + run_s[plan.lockstep] for plan in plans)
+
+
+def run_campaign(
+    order: Order, folder: Path, progress: Progress, whole: bool
+) -> tuple[tuple[Campaign, Results], ...]:
+    """Run one campaign, and return it with its results. See `Campaign`."""
+    campaign = Campaign(order, folder, progress, whole)
+    return ((campaign, campaign.run()),)
 
 
 def _load_matching_result(job: TrialJob) -> TrialResult | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -98,6 +98,21 @@ class Plan:
         return "\n".join([head, *kills, "", faults])
 
 
+def strike_active_copies(plans: Iterable[Plan], layout: Layout, board: str) -> list[Plan]:
+    """Return plans whose faults strike the copies of a board in turn, as they become active."""
+    names = [copy.name for copy in layout.list_copies(board)][:2]
+    return [
+        replace(
+            plan,
+            faults=tuple(
+                {**fault, "board": names[number % len(names)]}
+                for number, fault in enumerate(plan.faults)
+            ),
+        )
+        for plan in plans
+    ]
+
+
 def needs_real_time(kind: str) -> bool:
     """Return True if faults of a kind are not useful in lockstep.
 
@@ -140,14 +155,28 @@ class Targets:
         by_kind: Dictionary from the name of each kind to its targets.
     """
 
-    def __init__(self, config: RackConfig, layout: Layout) -> None:
+    def __init__(self, config: RackConfig, layout: Layout, board: str = "") -> None:
+        """Find the targets.
+
+        Args:
+            config: Config of the rack.
+            layout: Its layout.
+            board: The only board that may be affected. Empty for all.
+        """
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
+        # Only boards whose copies are compared can find a wrong output.
+        self._compared = {name for name, b in config.board.items() if b.compare or b.vote}
         self._roles = {task.name: task.role for task in layout.tasks}
         self._driving = {name: kind.faults for name, kind in find_executors(config).items()}
         self.by_kind = {kind.name: self._find_targets(kind) for kind in KINDS}
         # An external kill may also hit the clock's process.
         self.by_kind[EXTERNAL] = self._build_targets(EXTERNAL, [*self._roles, CLOCK])
+        if board:
+            self.by_kind = {
+                kind: [target for target in targets if target.board == board]
+                for kind, targets in self.by_kind.items()
+            }
 
     def _find_targets(self, kind: Kind) -> list[Target]:
         """Return the tasks or mailboxes in which a fault of a kind can be detected."""
@@ -185,6 +214,8 @@ class Targets:
         if role is None or not box.readers:
             return False
         if kind.where == "lock" and box.protocol != "lock":
+            return False
+        if kind.where == "copy" and box.writer not in self._compared:
             return False
         # A queue is written on demand. The position of its reader is not written through a port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position_mailbox(box)):

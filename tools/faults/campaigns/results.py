@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Document, write_json
+from rack.tools.faults.campaigns.outages import list_outages
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.statistics import EventRate, compute_rate
 from rack.tools.faults.campaigns.trial import Trial
@@ -44,6 +45,8 @@ class TrialResult:
         shortfalls: What was wrong, a line each. Empty for a successful trial.
         start: Tick of the snapshot from which the trial continued. 0 if it did not.
         whole: Why the trial did not continue from a snapshot. Empty if it did.
+        outages: Ticks without output after each fault that ended the process of an executor.
+        missing: Number of messages that the boards of its faults have not written.
     """
 
     plan: Plan
@@ -62,6 +65,8 @@ class TrialResult:
     shortfalls: tuple[str, ...]
     start: int = 0
     whole: str = ""
+    outages: tuple[int, ...] = ()
+    missing: int = 0
 
 
 def judge_trial(trial: Trial) -> TrialResult:
@@ -87,6 +92,10 @@ def judge_trial(trial: Trial) -> TrialResult:
         shortfalls=_list_shortfalls(trial, verdict, ended),
         start=trial.start.tick,
         whole=trial.start.whole,
+        outages=tuple(list_outages(trial.strikes, trial.events, trial.run.layout))
+        if trial.run is not None
+        else (),
+        missing=trial.missing,
     )
 
 

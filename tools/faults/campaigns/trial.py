@@ -26,6 +26,7 @@ from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.certainty import EarlyEnd
 from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
+from rack.tools.faults.campaigns.outages import count_missing_messages
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, list_strikes, read_arm
 from rack.tools.faults.judge import Circumstances
@@ -140,6 +141,7 @@ class Trial:
         is_late: Whether a level ended with an error because it could not meet a time.
         again: Outcome of a second run, without the faults, after a refused launch.
         start: Starting point of the trial.
+        missing: Number of messages that the boards of its faults have not written.
         is_cut: Whether the trial was ended early because the verdict on each fault was certain.
     """
 
@@ -156,6 +158,7 @@ class Trial:
     is_late: bool = False
     again: Outcome | None = None
     start: Start = field(default_factory=Start)
+    missing: int = 0
     is_cut: bool = False
 
 
@@ -203,6 +206,9 @@ def run_trial(
             _watch_run(rack, killer, ticks, seconds, certainty)
             trial.is_cut = certainty is not None and certainty.is_reached
             trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)
+            find_board = rack.segment.layout.find_first_copy
+            boards = {find_board(strike.board) for strike in trial.strikes}
+            trial.missing = count_missing_messages(rack.segment, boards)
             trial.arm = read_arm(rack.segment)
             trial.levels = format_levels(rack.segment)
             trial.is_late = is_late(rack.segment)
