@@ -6,6 +6,7 @@ import time
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,14 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.loader import read_stored
 from rack.tools.bridges.bridge import RackBridge
-from rack.tools.ecosystem.ros_messages import DIAGNOSTICS_S, RosEncoder, RosMessage, RosSource
+from rack.tools.ecosystem.ros_messages import (
+    DIAGNOSTICS_S,
+    LOG_TOPIC,
+    RosEncoder,
+    RosMessage,
+    RosSource,
+)
+from rack.tools.recording.current_run import EventFile, find_run_folder
 
 
 class Publisher(NamedTuple):
@@ -45,11 +53,12 @@ class TopicBridge(RackBridge):
         self.publishers: dict[str, Publisher] = {}
         self._sources: dict[str, list[RosSource]] = defaultdict(list)
         for source in self.encoder.sources:
-            topic, kind = source.topic
-            if topic not in self.publishers:
-                self.publishers[topic] = self.advertise(topic, kind)
+            if source.topic.name not in self.publishers:
+                self.publishers[source.topic.name] = self.advertise(*source.topic)
             self._sources[source.ring].append(source)
         self.rings = tuple(self._sources)
+        self._log = self.advertise(*LOG_TOPIC)
+        self._events = EventFile((find_run_folder(segment) or Path()) / "events.jsonl")
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
         self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
 
@@ -65,7 +74,7 @@ class TopicBridge(RackBridge):
             self._send(ring, rows[-1:])
 
     def advance(self, tick: int) -> None:
-        """Send the diagnostics of completed seconds."""
+        """Send the diagnostics of completed seconds, and the events of a recorded run."""
         complete = tick // self._second * self._second
         for ring, blocks in self._cycles.items():
             if blocks and blocks[0]["tick"][0] < complete:
@@ -73,6 +82,9 @@ class TopicBridge(RackBridge):
                 is_due = rows["tick"] < complete
                 blocks[:] = [] if is_due.all() else [rows[~is_due]]
                 self._send(ring, rows[is_due])
+        # The first reader gets the events since the start of the run.
+        for event in self._events.read_new_events() if self._log.has_readers() else ():
+            self._log.publish(self.encoder.encode_event(vars(event)))
 
     def _send(self, ring: str, rows: np.ndarray) -> None:
         """Encode and send the messages of a ring's topics."""

@@ -35,11 +35,12 @@ from rack.tools.console.answer import Document
 from rack.tools.recording.signal import list_signals
 
 if TYPE_CHECKING:
+    import mujoco
+
     from rack.levels.robot.cell import Cell
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """Types of ROS 2 Jazzy. Others may be registered."""
-LOG = "rcl_interfaces/msg/Log"
 WORLD = "world"
 STATUS_S = 0.02
 """Simulated time between two poses, or between two statuses of a board."""
@@ -64,6 +65,9 @@ class RosTopic(NamedTuple):
 
     name: str
     type_name: str
+
+
+LOG_TOPIC = RosTopic("/rosout", "rcl_interfaces/msg/Log")
 
 
 class RosSource(NamedTuple):
@@ -126,12 +130,13 @@ class RosEncoder:
 
     def encode_event(self, event: Document) -> RosMessage:
         """Encode an event of the run, given as in events.jsonl."""
-        tick, kind = event["tick"], event["kind"]
+        # The tick of events before the run is -1.
+        tick, kind = max(0, event["tick"]), event["kind"]
         source = event["board"] or self._layout.rack
         text = f"{kind}: {event['text']}"
-        stamp = self.build_header(tick).stamp
-        log = build(LOG, stamp, SEVERITIES.get(kind, 20), source, text, "", event["code"], 0)
-        return self._encode_message(tick, RosTopic("/rosout", LOG), log)
+        head = self.build_header(tick).stamp, SEVERITIES.get(kind, 20)
+        log = build(LOG_TOPIC.type_name, *head, source, text, "", event["code"], 0)
+        return self._encode_message(tick, LOG_TOPIC, log)
 
     def _encode_message(self, tick: int, topic: RosTopic, message: Any) -> RosMessage:
         data = STORE.serialize_cdr(message, topic.type_name)
@@ -165,7 +170,7 @@ class RosEncoder:
         from rack.levels.robot.engine import view_state
 
         model, data = cell.model, cell.build_start_data()
-        frames = [model.body(body).name or f"body_{body}" for body in range(1, model.nbody)]
+        _, *frames = list_frames(model)
         for row in self._select_rows(rows):
             view_state(model, data, row["message"]["state"])
             mujoco.mj_kinematics(model, data)
@@ -235,6 +240,11 @@ class RosEncoder:
     def _count_intervals(self, rows: Rows, seconds: float) -> Rows:
         """Return the number of whole intervals of simulated time before each row."""
         return np.asarray(rows["tick"] // max(1, round(seconds * 1e9 / self._layout.clock_ns)))
+
+
+def list_frames(model: mujoco.MjModel) -> list[str]:
+    """Return the name of the frame of each body."""
+    return [WORLD, *(model.body(body).name or f"body_{body}" for body in range(1, model.nbody))]
 
 
 def build(type_name: str, *values: Any) -> Any:
