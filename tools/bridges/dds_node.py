@@ -22,7 +22,7 @@ from cyclonedds.topic import Topic
 from rosbags.interfaces import Nodetype
 
 from rack.tools.bridges.bridge import Tell
-from rack.tools.bridges.ros_node import MAX_WAITING, RosNode, find_hash
+from rack.tools.bridges.ros_node import MAX_WAITING, STOP_SERVICE, RosNode
 from rack.tools.bridges.topics import Publisher
 from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE
@@ -51,20 +51,20 @@ class DdsNode(RosNode):
             raise Failure("CycloneDDS found no network, or CYCLONEDDS_URI is wrong") from None
 
     def _create(self, create: Any, topic: str, kind: str, digest: str = "") -> Any:
-        """Create a writer or reader of a topic."""
+        """Create a writer or reader of a topic. Messages have a type hash as `digest`."""
         qos = Qos(*QOS, Policy.Userdata(f"{HASH_KEY}{digest};".encode() if digest else b""))
         return create(self._participant, Topic(self._participant, topic, build_type(kind)), qos=qos)
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""
-        writer = self._create(DataWriter, f"rt{topic}", kind, find_hash(kind))
+        writer = self._create(DataWriter, f"rt{topic}", kind, STORE.hash_rihs01(kind))
         return Publisher(
             lambda: bool(writer.matched_sub), lambda message: _write(writer, bytes(message.data))
         )
 
     def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None]) -> None:
         """Pass the newest message of a topic to `take`."""
-        digest = find_hash(kind)
+        digest = STORE.hash_rihs01(kind)
         reader = self._create(DataReader, f"rt{topic}", kind, digest)
         wire_type = build_type(kind).__idl_typename__
         # DDS connects nobody who publishes another type, so nothing would be seen of it.
@@ -84,10 +84,11 @@ class DdsNode(RosNode):
 
         self.polls.append(take_newest)
 
-    def serve(self, service: str, kind: str, answer: Callable[[], bytes]) -> None:
-        """Answer the requests to a service."""
-        reader = self._create(DataReader, f"rq{service}Request", f"{kind}_Request")
-        writer = self._create(DataWriter, f"rr{service}Reply", f"{kind}_Response")
+    def serve(self, answer: Callable[[], bytes]) -> None:
+        """Answer the requests to the service."""
+        trigger = "std_srvs/srv/Trigger"
+        reader = self._create(DataReader, f"rq{STOP_SERVICE}Request", f"{trigger}_Request")
+        writer = self._create(DataWriter, f"rr{STOP_SERVICE}Reply", f"{trigger}_Response")
 
         def reply_all() -> None:
             for request in _take(reader):

@@ -15,7 +15,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.levels.references import find_class
 from rack.tools.bridges.bridge import Tell
-from rack.tools.bridges.ros_node import RESPONSE, TRIGGER, RosNode
+from rack.tools.bridges.ros_node import RESPONSE, STOP_SERVICE, RosNode
 from rack.tools.bridges.topics import Publisher, TopicBridge
 from rack.tools.bridges.trajectory import TYPE, TrajectoryFollower, find_motion_board
 from rack.tools.console.answer import Failure
@@ -26,7 +26,6 @@ NODES = {
     "rmw_cyclonedds_cpp": "rack.tools.bridges.dds_node:DdsNode",
 }
 """Class of the node for each transport, named as in ROS. The first one is the default."""
-STOP_SERVICE = "/rack/emergency_stop"
 TRAJECTORY_TOPIC = "/joint_trajectory"
 QUIET_S = 1.0
 """Shortest time between two lines about the same topic."""
@@ -47,7 +46,7 @@ class Ros2Bridge(TopicBridge):
         name = convert_name(f"rack_{segment.rack}")
         self._node = find_class(NODES[transport], RosNode)(name, self._tell_rarely)
         super().__init__(segment)
-        self._node.serve(STOP_SERVICE, TRIGGER, self._stop)
+        self._node.serve(self._stop)
         trajectories = self._take_trajectories(segment)
         text = f"{transport}, domain {self._node.domain}: {len(self.publishers)} topics"
         tell(f"{text}, {STOP_SERVICE}, {trajectories}{self._node.describe_state()}")

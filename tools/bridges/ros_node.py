@@ -13,9 +13,9 @@ from rack.tools.bridges.topics import Publisher
 from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE
 
-TRIGGER = "std_srvs/srv/Trigger"
+STOP_SERVICE = "/rack/emergency_stop"
+"""The service of a rack, of type `std_srvs/srv/Trigger`."""
 RESPONSE = "std_srvs/msg/Trigger_Response"
-TRIGGER_HASH = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
 STORE.register(get_types_from_msg("bool success\nstring message", RESPONSE))
 STORE.register(
     get_types_from_msg("uint8 structure_needs_at_least_one_member", "std_srvs/msg/Trigger_Request")
@@ -23,11 +23,6 @@ STORE.register(
 MAX_DOMAIN = 232
 MAX_WAITING = 16
 """Number of messages or requests that wait for `poll`. Older ones are dropped."""
-
-
-def find_hash(kind: str) -> str:
-    """Return the hash of a type, such as `sensor_msgs/msg/JointState`, by which ROS compares it."""
-    return TRIGGER_HASH if kind == TRIGGER else STORE.hash_rihs01(kind)
 
 
 class RosNode(ABC):
@@ -58,8 +53,8 @@ class RosNode(ABC):
         """Pass the newest message of a topic to `take`, as CDR. Other types are reported."""
 
     @abstractmethod
-    def serve(self, service: str, kind: str, answer: Callable[[], bytes]) -> None:
-        """Call `answer` for each request to a service, and reply with the CDR that it returns."""
+    def serve(self, answer: Callable[[], bytes]) -> None:
+        """Call `answer` for each request to `STOP_SERVICE`, and reply with the CDR it returns."""
 
     @abstractmethod
     def close(self) -> None:

@@ -58,7 +58,8 @@ class TopicBridge(RackBridge):
             self._sources[source.ring].append(source)
         self.rings = tuple(self._sources)
         self._log = self.advertise(*LOG_TOPIC)
-        self._events = EventFile((find_run_folder(segment) or Path()) / "events.jsonl")
+        folder = find_run_folder(segment) or Path("/dev/null")
+        self._events = EventFile(folder / "events.jsonl")
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
         self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
 

@@ -20,10 +20,10 @@ from xxhash import xxh3_128_intdigest
 
 from rack.backplane.json_text import encode_json
 from rack.tools.bridges.bridge import Tell
-from rack.tools.bridges.ros_node import MAX_WAITING, RosNode, find_hash
+from rack.tools.bridges.ros_node import MAX_WAITING, STOP_SERVICE, RosNode
 from rack.tools.bridges.topics import Publisher
 from rack.tools.console.answer import Failure
-from rack.tools.ecosystem.ros_messages import RosMessage
+from rack.tools.ecosystem.ros_messages import STORE, RosMessage
 
 CONFIG_VARIABLE = "ZENOH_SESSION_CONFIG_URI"
 """Environment variable with the path of a configuration of zenoh, as for rmw_zenoh."""
@@ -38,6 +38,10 @@ SETTINGS = {
     "scouting/multicast/enabled": False,
 }
 """Differences between the sessions of rmw_zenoh and of zenoh."""
+TRIGGER_KEY = (
+    "std_srvs::srv::dds_::Trigger_/"
+    "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+)
 QOS = "::,10:,:,:,,"
 """Quality of service in a token: reliable, volatile, the last 10 messages."""
 
@@ -45,7 +49,7 @@ QOS = "::,10:,:,:,,"
 def build_key(kind: str) -> str:
     """Return a type as in a key, `sensor_msgs::msg::dds_::JointState_/RIHS01_...`."""
     package, group, name = kind.split("/")
-    return f"{package}::{group}::dds_::{name}_/{find_hash(kind)}"
+    return f"{package}::{group}::dds_::{name}_/{STORE.hash_rihs01(kind)}"
 
 
 class ZenohNode(RosNode):
@@ -68,20 +72,21 @@ class ZenohNode(RosNode):
         self._tokens: list[Any] = []
         self._declare_token("NN")
 
-    def _declare_token(self, entity: str, topic: str = "", kind: str = "") -> bytes:
+    def _declare_token(self, entity: str, topic: str = "", key: str = "") -> bytes:
         """Declare the liveliness token of an entity, and return the entity's GID, 16 bytes."""
         number = len(self._tokens)
         place = ["@ros2_lv", self.domain, self._session.zid(), 0, number, entity, "%", "%"]
         token = "/".join(map(str, [*place, self.name]))
-        if kind:
-            token += f"/{topic.replace('/', '%')}/{build_key(kind)}/{QOS}"
+        if key:
+            token += f"/{topic.replace('/', '%')}/{key}/{QOS}"
         self._tokens.append(self._session.liveliness().declare_token(token))
         return xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""
-        publisher: Any = self._session.declare_publisher(f"{self.domain}{topic}/{build_key(kind)}")
-        gid = self._declare_token("MP", topic, kind)
+        key = build_key(kind)
+        publisher: Any = self._session.declare_publisher(f"{self.domain}{topic}/{key}")
+        gid = self._declare_token("MP", topic, key)
         numbers = count(1)
 
         def publish(message: RosMessage) -> None:
@@ -97,7 +102,7 @@ class ZenohNode(RosNode):
         channel: Any = self._session.declare_subscriber(
             f"{self.domain}{topic}/*/*", zenoh.handlers.RingChannel(MAX_WAITING)
         )
-        self._declare_token("MS", topic, kind)
+        self._declare_token("MS", topic, key)
 
         def take_newest() -> None:
             newest = None
@@ -111,14 +116,14 @@ class ZenohNode(RosNode):
 
         self.polls.append(take_newest)
 
-    def serve(self, service: str, kind: str, answer: Callable[[], bytes]) -> None:
-        """Answer the requests to a service."""
+    def serve(self, answer: Callable[[], bytes]) -> None:
+        """Answer the requests to the service."""
         channel: Any = self._session.declare_queryable(
-            f"{self.domain}{service}/{build_key(kind)}",
+            f"{self.domain}{STOP_SERVICE}/{TRIGGER_KEY}",
             zenoh.handlers.RingChannel(MAX_WAITING),
             complete=True,
         )
-        self._declare_token("SS", service, kind)
+        self._declare_token("SS", STOP_SERVICE, TRIGGER_KEY)
 
         def reply_all() -> None:
             for query in _take_waiting(channel):
