@@ -1,4 +1,4 @@
-"""What the two transports of ROS 2 have in common."""
+"""Base class of the nodes of ROS 2, one for each transport."""
 
 from __future__ import annotations
 

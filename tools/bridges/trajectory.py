@@ -47,14 +47,14 @@ class Point(NamedTuple):
     joints: list[float]
 
 
-class Trajectory(NamedTuple):
+class RosTrajectory(NamedTuple):
     """Points of a trajectory, and the fields with values that cannot be followed."""
 
     points: list[Point]
     ignored: list[str]
 
 
-def read_trajectory(data: bytes, joints: Sequence[str]) -> Trajectory:
+def read_trajectory(data: bytes, joints: Sequence[str]) -> RosTrajectory:
     """Return an encoded `JointTrajectory`.
 
     Args:
@@ -88,7 +88,7 @@ def read_trajectory(data: bytes, joints: Sequence[str]) -> Trajectory:
         points.append(Point(time_s, point.positions[order].tolist()))
         before_s = time_s
     ignored = [name for name in IGNORED if any(getattr(p, name).any() for p in message.points)]
-    return Trajectory(points, ignored)
+    return RosTrajectory(points, ignored)
 
 
 def find_motion_board(segment: Segment) -> HostWiring | None:

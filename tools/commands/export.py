@@ -70,8 +70,9 @@ def export(
     try:
         module = import_module(f"rack.tools.ecosystem.{exporter.module}")
     except ImportError as error:
+        package = str(error.name).partition(".")[0]
         install = f"pip install 'nasrem-rack[{exporter.extra}]'"
-        raise Failure(f"--to {to} needs {error.name}: {install}", 2) from None
+        raise Failure(f"--to {to} needs {package}: {install}", 2) from None
     recording = Recording(run)
     path = run / exporter.name if out is None else out
     if path.exists():
