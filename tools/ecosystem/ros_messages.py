@@ -16,7 +16,7 @@ model, in the frame `world`. Time stamps are simulated time, counted from `epoch
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,7 +56,7 @@ SEVERITIES = {"fault": 30, "detection": 30, "miss": 30, "died": 40}
 """Severity of each kind of event in a `Log`. Other events are of severity 20, "info"."""
 
 Rows = np.ndarray
-Converter = Callable[[Rows], Iterator[tuple[int, Any]]]
+Converter = Callable[[Any], Iterator[tuple[int, Any]]]
 """Converts rows to messages of `STORE`, each with its tick, oldest first."""
 
 
@@ -65,9 +65,6 @@ class RosTopic(NamedTuple):
 
     name: str
     type_name: str
-
-
-LOG_TOPIC = RosTopic("/rosout", "rcl_interfaces/msg/Log")
 
 
 class RosSource(NamedTuple):
@@ -96,12 +93,15 @@ class RosEncoder:
 
     Attributes:
         sources: Topics with their rings. Several sources may have the same topic or ring.
+        log: The topic of the events, given as in events.jsonl. It has no ring.
     """
 
     def __init__(self, layout: Layout, config: RackConfig, epoch_ns: int = 0) -> None:
         self._layout = layout
         self._epoch_ns = epoch_ns
         self.sources = [*self._list_sources(config)]
+        log = RosTopic("/rosout", "rcl_interfaces/msg/Log")
+        self.log = RosSource("", log, self._convert_events)
 
     def _list_sources(self, config: RackConfig) -> Iterator[RosSource]:
         """Yield the sources of tasks, then those of mailboxes."""
@@ -123,24 +123,11 @@ class RosEncoder:
                 cell = build_rack_cell(config)
                 yield RosSource(box.name, topic, partial(self._convert_poses, cell))
 
-    def encode(self, source: RosSource, rows: Rows) -> Iterator[RosMessage]:
-        """Yield the messages that rows of the source's ring become, oldest first."""
+    def encode(self, source: RosSource, rows: Any) -> Iterator[RosMessage]:
+        """Yield the messages that rows of the source's ring, or events, become, oldest first."""
         for tick, message in source.convert(rows):
-            yield self._encode_message(tick, source.topic, message)
-
-    def encode_event(self, event: Document) -> RosMessage:
-        """Encode an event of the run, given as in events.jsonl."""
-        # The tick of events before the run is -1.
-        tick, kind = max(0, event["tick"]), event["kind"]
-        source = event["board"] or self._layout.rack
-        text = f"{kind}: {event['text']}"
-        head = self.build_header(tick).stamp, SEVERITIES.get(kind, 20)
-        log = build(LOG_TOPIC.type_name, *head, source, text, "", event["code"], 0)
-        return self._encode_message(tick, LOG_TOPIC, log)
-
-    def _encode_message(self, tick: int, topic: RosTopic, message: Any) -> RosMessage:
-        data = STORE.serialize_cdr(message, topic.type_name)
-        return RosMessage(self.compute_time(tick), topic, data)
+            data = STORE.serialize_cdr(message, source.topic.type_name)
+            yield RosMessage(self.compute_time(tick), source.topic, data)
 
     def compute_time(self, tick: int) -> int:
         """Return the time stamp of a tick, in ns."""
@@ -150,6 +137,16 @@ class RosEncoder:
         """Return a `std_msgs/msg/Header` with the time stamp of a tick."""
         stamp = build("builtin_interfaces/msg/Time", *divmod(self.compute_time(tick), 10**9))
         return build("std_msgs/msg/Header", stamp, frame)
+
+    def _convert_events(self, events: Iterable[Document]) -> Iterator[tuple[int, Any]]:
+        """Yield a `Log` for each event of the run."""
+        for event in events:
+            # The tick of events before the run is -1.
+            tick, kind = max(0, event["tick"]), event["kind"]
+            source = event["board"] or self._layout.rack
+            text = f"{kind}: {event['text']}"
+            head = self.build_header(tick).stamp, SEVERITIES.get(kind, 20)
+            yield tick, build(self.log.topic.type_name, *head, source, text, "", event["code"], 0)
 
     def _convert_joints(self, robot: RobotConfig, rows: Rows) -> Iterator[tuple[int, Any]]:
         """Yield a `JointState` for each status of the arm. The gripper's joint comes last."""

@@ -56,7 +56,7 @@ def export_bag(recording: Recording, path: Path, show_progress: Callable[[float]
     mailboxes = MailboxEncoder(encoder)
     events = [event for event in recording.events if event.get("tick", -1) >= 0]
     streams = [
-        map(encoder.encode_event, events),
+        encoder.encode(encoder.log, events),
         *(mailboxes.encode(box, recording.read_rows(box.name)) for box in boxes),
         *(
             encoder.encode(source, recording.read_rows(source.ring))
