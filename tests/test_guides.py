@@ -30,9 +30,10 @@ BLOCK = re.compile(
 """Commands, and lines that they print: "..." stands for anything."""
 BOUND_S = 200
 LAUNCH_S = 60
-NAMES = "nasrem|hardware"
+NAMES = "nasrem|hardware|chimera"
 """Racks that pages launch under a name that another test may use at the same time."""
-ENDLESS = " --set board.task.ends_run=false --seconds 300"
+ENDLESS = " --seconds 300"
+NO_END = " --set board.task.ends_run=false"
 """For a run in another terminal: on a busy machine the page's commands may take longer than its
 task."""
 SHORT = " --seconds 2 --no-record"
@@ -143,7 +144,8 @@ def test_guide_can_be_followed_to_its_end(name: str, shell: PageShell) -> None:
         if mark.startswith("file "):
             (shell.folder / mark.removeprefix("file ")).write_text(code)
         elif mark == "background":
-            shell.start(with_own_name(code.strip(), shell.own) + ENDLESS)
+            of_task = NO_END if "nasrem" in code else ""
+            shell.start(with_own_name(code.strip(), shell.own) + of_task + ENDLESS)
         elif language == "python":
             named = code.replace(
                 'Rack("nasrem"', f'Rack("nasrem", settings={{"name": "{shell.own}"}}'

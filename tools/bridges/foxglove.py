@@ -1,19 +1,17 @@
 """Serves a running rack to Foxglove: the cell as a scene, curves of the joints, timing and the log.
 
-Besides the topics for ROS 2 there are `/cell`, the geoms of the model in the frames of `/tf`,
-`/timing/BOARD`, the times of a board's cycles, and `/log`, the events of a recorded run.
+Besides the topics for ROS 2 there are `/cell`, the geoms of the model in the frames of `/tf`, and
+`/timing/BOARD`, the times of a board's cycles.
 """
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import foxglove
 import numpy as np
-from foxglove.channels import LogChannel, SceneUpdateChannel
-from foxglove.messages import Log, LogLevel, Timestamp
+from foxglove.channels import SceneUpdateChannel
 
 from rack.backplane.segment import Segment
 from rack.boards.config.cell import build_rack_cell
@@ -24,14 +22,11 @@ from rack.tools.bridges.scene import build_scene
 from rack.tools.bridges.topics import Publisher, TopicBridge
 from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE
-from rack.tools.recording.current_run import EventFile, find_run_folder
 
 HOST = "127.0.0.1"
 PORT_VARIABLE = "FOXGLOVE_PORT"
 PORT = 8765
 """Port to which Foxglove connects by default."""
-TROUBLES = ("died", "detection", "fault", "reaction")
-"""Kinds of events that are warnings in the log."""
 
 
 class FoxgloveBridge(TopicBridge):
@@ -42,17 +37,13 @@ class FoxgloveBridge(TopicBridge):
         self._new_readers = False
         super().__init__(segment)
         config = read_stored(segment.config)
-        self._scene = None
-        if config.robot is not None:
-            self._scene = build_scene(build_rack_cell(config).model)
+        has_cell = config.robot is not None
+        self._scene = build_scene(build_rack_cell(config).model) if has_cell else None
         self._cell = SceneUpdateChannel("/cell", context=self._context)
-        self._log = LogChannel("/log", context=self._context)
         self._timing = {
             task.name: foxglove.Channel(f"/timing/{task.name}", context=self._context)
             for task in segment.layout.tasks
         }
-        folder = find_run_folder(segment)
-        self._events = EventFile((folder or Path()) / "events.jsonl")
         port = os.environ.get(PORT_VARIABLE) or PORT
         listener: Any = self
         try:
@@ -96,20 +87,9 @@ class FoxgloveBridge(TopicBridge):
     def advance(self, tick: int) -> None:
         """Send diagnostics and events, and the whole cell to new readers."""
         super().advance(tick)
-        time_ns = self.encoder.compute_time(tick)
         if self._new_readers and self._scene is not None:
             self._new_readers = False
-            self._cell.log(self._scene, log_time=time_ns)
-        # The first reader gets the events since the start of the run.
-        for event in self._events.read_new_events() if self._log.has_sinks() else ():
-            when_ns = self.encoder.compute_time(max(0, event.tick))
-            entry = Log(
-                timestamp=Timestamp(*divmod(when_ns, 10**9)),
-                level=LogLevel.Warning if event.kind in TROUBLES else LogLevel.Info,
-                message=f"{event.kind}: {event.text}",
-                name=event.board,
-            )
-            self._log.log(entry, log_time=when_ns)
+            self._cell.log(self._scene, log_time=self.encoder.compute_time(tick))
 
     def close(self) -> None:
         """Disconnect all clients."""

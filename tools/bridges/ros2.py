@@ -7,26 +7,25 @@ for motion requests takes `/joint_trajectory`.
 
 from __future__ import annotations
 
+import os
 import time
-
-from rosbags.typesys import get_types_from_msg
 
 from rack.backplane.errors import MailboxError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
+from rack.levels.references import find_class
 from rack.tools.bridges.bridge import Tell
-from rack.tools.bridges.ros_node import RosNode, RosType
+from rack.tools.bridges.ros_node import RESPONSE, STOP_SERVICE, RosNode
 from rack.tools.bridges.topics import Publisher, TopicBridge
 from rack.tools.bridges.trajectory import TYPE, TrajectoryFollower, find_motion_board
+from rack.tools.console.answer import Failure
 from rack.tools.ecosystem.ros_messages import STORE, build, convert_name
 
-STOP_SERVICE = "/rack/emergency_stop"
-TRIGGER = RosType(
-    "std_srvs/srv/Trigger",
-    "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
-)
-RESPONSE = "std_srvs/msg/Trigger_Response"
-STORE.register(get_types_from_msg("bool success\nstring message", RESPONSE))
+NODES = {
+    "rmw_zenoh_cpp": "rack.tools.bridges.zenoh_node:ZenohNode",
+    "rmw_cyclonedds_cpp": "rack.tools.bridges.dds_node:DdsNode",
+}
+"""Class of the node for each transport, named as in ROS. The first one is the default."""
 TRAJECTORY_TOPIC = "/joint_trajectory"
 QUIET_S = 1.0
 """Shortest time between two lines about the same topic."""
@@ -40,16 +39,21 @@ class Ros2Bridge(TopicBridge):
         self._show = tell
         self._lines = UtilityLines(segment)
         self._follower: TrajectoryFollower | None = None
-        self._node = RosNode(convert_name(f"rack_{segment.rack}"), self._tell_rarely)
+        transport = os.environ.get("RMW_IMPLEMENTATION") or next(iter(NODES))
+        if transport not in NODES:
+            why = f"must be {' or '.join(NODES)}"
+            raise Failure(f"RMW_IMPLEMENTATION = {transport}: {why}", 2)
+        name = convert_name(f"rack_{segment.rack}")
+        self._node = find_class(NODES[transport], RosNode)(name, self._tell_rarely)
         super().__init__(segment)
-        self._node.serve(STOP_SERVICE, TRIGGER, self._stop)
+        self._node.serve(self._stop)
         trajectories = self._take_trajectories(segment)
-        text = f"rmw_zenoh, domain {self._node.domain}: {len(self.publishers)} topics"
-        tell(f"{text}, {STOP_SERVICE}, {trajectories}{self._node.describe_router()}")
+        text = f"{transport}, domain {self._node.domain}: {len(self.publishers)} topics"
+        tell(f"{text}, {STOP_SERVICE}, {trajectories}{self._node.describe_state()}")
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""
-        return self._node.advertise(topic, RosType(kind, STORE.hash_rihs01(kind)))
+        return self._node.advertise(topic, kind)
 
     def _stop(self) -> bytes:
         """Set the emergency stop, and return the encoded response."""
@@ -64,9 +68,7 @@ class Ros2Bridge(TopicBridge):
         if (wiring := find_motion_board(segment)) is not None:
             try:
                 self._follower = TrajectoryFollower(segment, wiring, self._tell_rarely)
-                take = self._follower.take_message
-                kind = RosType(TYPE, STORE.hash_rihs01(TYPE))
-                self._node.subscribe(TRAJECTORY_TOPIC, kind, take)
+                self._node.subscribe(TRAJECTORY_TOPIC, TYPE, self._follower.take_message)
                 return TRAJECTORY_TOPIC
             except MailboxError as error:
                 why = str(error)
@@ -83,7 +85,8 @@ class Ros2Bridge(TopicBridge):
     def advance(self, tick: int) -> None:
         """Send diagnostics, and process what has been received."""
         super().advance(tick)
-        self._node.poll()
+        for poll in self._node.polls:
+            poll()
 
     def close(self) -> None:
         """Leave the network."""

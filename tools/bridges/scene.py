@@ -10,16 +10,13 @@ import numpy as np
 from foxglove import messages as fox
 
 from rack.levels.algebra import Array
-from rack.tools.ecosystem.ros_messages import WORLD
+from rack.tools.ecosystem.ros_messages import list_frames
 
 Geom = mujoco.mjtGeom
-CUBE: tuple[str, Any] = "cubes", fox.CubePrimitive
-SPHERE: tuple[str, Any] = "spheres", fox.SpherePrimitive
-CYLINDER: tuple[str, Any] = (
-    "cylinders",
-    partial(fox.CylinderPrimitive, bottom_scale=1.0, top_scale=1.0),
-)
-SHAPES = {
+CUBE = "cubes", fox.CubePrimitive
+SPHERE = "spheres", fox.SpherePrimitive
+CYLINDER = "cylinders", partial(fox.CylinderPrimitive, bottom_scale=1.0, top_scale=1.0)
+SHAPES: dict[int, tuple[str, Any]] = {
     Geom.mjGEOM_BOX: CUBE,
     Geom.mjGEOM_PLANE: CUBE,
     Geom.mjGEOM_SPHERE: SPHERE,
@@ -38,42 +35,42 @@ MAX_HALF_M = 2.0
 def build_scene(model: mujoco.MjModel) -> fox.SceneUpdate:
     """Return the visible geoms of a model. Height fields are left out."""
     entities = []
+    frames = list_frames(model)
     for geom in np.flatnonzero(model.geom_group < SHOWN_GROUPS).tolist():
         material = model.geom_matid[geom]
         rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-        position = _build(fox.Vector3, "xyz", model.geom_pos[geom])
-        orientation = _build(fox.Quaternion, "wxyz", model.geom_quat[geom])
         look: dict[str, Any] = {
-            "pose": fox.Pose(position=position, orientation=orientation),
+            "pose": fox.Pose(
+                position=_build(fox.Vector3, "xyz", model.geom_pos[geom]),
+                orientation=_build(fox.Quaternion, "wxyz", model.geom_quat[geom]),
+            ),
             "color": _build(fox.Color, "rgba", rgba),
         }
         kind = Geom(int(model.geom_type[geom]))
         if kind == Geom.mjGEOM_MESH:
-            field, primitive = "triangles", _build_mesh(model, model.geom_dataid[geom], look)
+            mesh = model.mesh(model.geom_dataid[geom])
+            points = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
+            faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
+            field, build_shape = "triangles", fox.TriangleListPrimitive
+            look["points"] = [_build(fox.Point3, "xyz", point) for point in points]
+            look["indices"] = faces.ravel().tolist()
         elif kind in SHAPES:
             field, build_shape = SHAPES[kind]
             size = 2.0 * np.minimum(model.geom_aabb[geom, 3:], MAX_HALF_M)
             size[2] *= kind != Geom.mjGEOM_PLANE
-            primitive = build_shape(size=_build(fox.Vector3, "xyz", size), **look)
+            look["size"] = _build(fox.Vector3, "xyz", size)
         else:
             continue
-        body = int(model.geom_bodyid[geom])
-        # The names of the frames in /tf.
-        frame = model.body(body).name or f"body_{body}" if body else WORLD
-        shown: dict[str, Any] = {field: [primitive]}
+        shown: dict[str, Any] = {field: [build_shape(**look)]}
         entities.append(
-            fox.SceneEntity(id=f"geom {geom}", frame_id=frame, frame_locked=True, **shown)
+            fox.SceneEntity(
+                id=f"geom {geom}",
+                frame_id=frames[model.geom_bodyid[geom]],
+                frame_locked=True,
+                **shown,
+            )
         )
     return fox.SceneUpdate(entities=entities)
-
-
-def _build_mesh(model: mujoco.MjModel, number: int, look: dict[str, Any]) -> Any:
-    """Return the triangles of a mesh."""
-    mesh = model.mesh(number)
-    vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
-    faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
-    points = [_build(fox.Point3, "xyz", vertex) for vertex in vertices]
-    return fox.TriangleListPrimitive(points=points, indices=faces.ravel().tolist(), **look)
 
 
 def _build(kind: Any, keys: str, values: Array) -> Any:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from rack.backplane.words import System
 from rack.boards.config.loader import read_stored
 from rack.tools.bridges.bridge import RackBridge
 from rack.tools.ecosystem.ros_messages import DIAGNOSTICS_S, RosEncoder, RosMessage, RosSource
+from rack.tools.recording.current_run import EventFile, find_run_folder
 
 
 class Publisher(NamedTuple):
@@ -44,12 +46,13 @@ class TopicBridge(RackBridge):
         self.encoder = RosEncoder(layout, read_stored(segment.config), epoch_ns)
         self.publishers: dict[str, Publisher] = {}
         self._sources: dict[str, list[RosSource]] = defaultdict(list)
-        for source in self.encoder.sources:
-            topic, kind = source.topic
-            if topic not in self.publishers:
-                self.publishers[topic] = self.advertise(topic, kind)
+        for source in (*self.encoder.sources, self.encoder.log):
+            if source.topic.name not in self.publishers:
+                self.publishers[source.topic.name] = self.advertise(*source.topic)
             self._sources[source.ring].append(source)
         self.rings = tuple(self._sources)
+        folder = find_run_folder(segment) or Path("/dev/null")
+        self._events = EventFile(folder / "events.jsonl")
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
         self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
 
@@ -62,21 +65,23 @@ class TopicBridge(RackBridge):
         if ring in self._cycles:
             self._cycles[ring].append(rows)
         else:
-            self._send(ring, rows[-1:])
+            self._send(self._sources[ring], rows[-1:])
 
     def advance(self, tick: int) -> None:
-        """Send the diagnostics of completed seconds."""
+        """Send the diagnostics of completed seconds, and the events of a recorded run."""
         complete = tick // self._second * self._second
         for ring, blocks in self._cycles.items():
             if blocks and blocks[0]["tick"][0] < complete:
                 rows = np.concatenate(blocks)
                 is_due = rows["tick"] < complete
                 blocks[:] = [] if is_due.all() else [rows[~is_due]]
-                self._send(ring, rows[is_due])
+                self._send(self._sources[ring], rows[is_due])
+        # The first reader gets the events since the start of the run.
+        self._send([self.encoder.log], map(vars, self._events.read_new_events()))
 
-    def _send(self, ring: str, rows: np.ndarray) -> None:
-        """Encode and send the messages of a ring's topics."""
-        for source in self._sources[ring]:
+    def _send(self, sources: Iterable[RosSource], rows: Any) -> None:
+        """Encode and send what rows or events become, unless nobody receives it."""
+        for source in sources:
             publisher = self.publishers[source.topic.name]
             if publisher.has_readers():
                 for message in self.encoder.encode(source, rows):

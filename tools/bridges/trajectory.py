@@ -28,6 +28,8 @@ from rack.tools.bridges.bridge import Tell
 from rack.tools.ecosystem.ros_messages import STORE
 
 TYPE = "trajectory_msgs/msg/JointTrajectory"
+IGNORED = ("velocities", "accelerations", "effort")
+"""Fields of a point that motion requests cannot express."""
 MAX_BYTES = 1 << 20
 """Longest message that is taken from the network."""
 AHEAD = 8
@@ -45,8 +47,15 @@ class Point(NamedTuple):
     joints: list[float]
 
 
-def read_trajectory(data: bytes, joints: Sequence[str]) -> list[Point]:
-    """Return the points of an encoded `JointTrajectory`.
+class RosTrajectory(NamedTuple):
+    """Points of a trajectory, and the fields with values that cannot be followed."""
+
+    points: list[Point]
+    ignored: list[str]
+
+
+def read_trajectory(data: bytes, joints: Sequence[str]) -> RosTrajectory:
+    """Return an encoded `JointTrajectory`.
 
     Args:
         data: The message as CDR, from an untrusted sender.
@@ -70,13 +79,16 @@ def read_trajectory(data: bytes, joints: Sequence[str]) -> list[Point]:
     before_s = -1e-9
     for at, point in enumerate(message.points):
         time_s = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
-        if len(point.positions) != len(joints):
-            raise ValueError(f"points[{at}].positions: must be {len(joints)} numbers")
+        for name in ("positions", *IGNORED):
+            count = len(getattr(point, name))
+            if count != len(joints) and (count or name == "positions"):
+                raise ValueError(f"points[{at}].{name} has length {count}: must be {len(joints)}")
         if not before_s < time_s:
             raise ValueError(f"points[{at}].time_from_start = {time_s:g} s: must rise from 0 on")
         points.append(Point(time_s, point.positions[order].tolist()))
         before_s = time_s
-    return points
+    ignored = [name for name in IGNORED if any(getattr(p, name).any() for p in message.points)]
+    return RosTrajectory(points, ignored)
 
 
 def find_motion_board(segment: Segment) -> HostWiring | None:
@@ -121,7 +133,10 @@ class TrajectoryFollower:
     def take_message(self, data: bytes) -> None:
         """Follow the trajectory of a message, or report its mistake. Without points: stop."""
         try:
-            self._trajectories.put(read_trajectory(data, self._joints))
+            points, ignored = read_trajectory(data, self._joints)
+            if ignored:
+                self._tell(f"/joint_trajectory without {', '.join(ignored)}: not supported")
+            self._trajectories.put(points)
         except ValueError as error:
             self._tell(f"/joint_trajectory: {error}")
 

@@ -28,8 +28,9 @@ def bridge(
     'rack run --ros2' and 'rack run --foxglove' do the same from the first tick on. A bridge reads
     the same rings as the recorder, and causes no missed deadlines. The rack goes on if it ends.
 
-    ROS_DOMAIN_ID and ZENOH_SESSION_CONFIG_URI have the same meaning as in ROS. FOXGLOVE_PORT is the
-    port for Foxglove, 8765 by default.
+    RMW_IMPLEMENTATION (rmw_zenoh_cpp or rmw_cyclonedds_cpp), ROS_DOMAIN_ID, CYCLONEDDS_URI and
+    ZENOH_SESSION_CONFIG_URI have the same meaning as in ROS. FOXGLOVE_PORT is the port for
+    Foxglove, 8765 by default.
 
     Exit status: 0 the run is over; 1 there is no such rack, or the connection failed; 2 usage.
 

@@ -22,24 +22,20 @@ class Exporter(NamedTuple):
         function: Function that writes the file and returns the number of its entries.
         name: Default name of the file in the folder of the run.
         entries: Word for the entries.
-        package: Package that the module needs.
-        extra: Extra that installs the package.
+        extra: Extra that installs what the module needs.
     """
 
     module: str
     function: str
     name: str
     entries: str
-    package: str
     extra: str
 
 
 EXPORTERS = {
-    "mcap": Exporter("rosbag2", "export_mcap", "run.mcap", "messages", "rosbags", "export"),
-    "rosbag2": Exporter("rosbag2", "export_bag", "run-rosbag2", "messages", "rosbags", "export"),
-    "perfetto": Exporter(
-        "perfetto_trace", "export_trace", "run.pftrace", "slices", "perfetto", "perfetto"
-    ),
+    "mcap": Exporter("rosbag2", "export_mcap", "run.mcap", "messages", "export"),
+    "rosbag2": Exporter("rosbag2", "export_bag", "run-rosbag2", "messages", "export"),
+    "perfetto": Exporter("perfetto_trace", "export_trace", "run.pftrace", "slices", "perfetto"),
 }
 
 
@@ -74,10 +70,9 @@ def export(
     try:
         module = import_module(f"rack.tools.ecosystem.{exporter.module}")
     except ImportError as error:
-        if error.name is None or error.name.partition(".")[0] != exporter.package:
-            raise
+        package = str(error.name).partition(".")[0]
         install = f"pip install 'nasrem-rack[{exporter.extra}]'"
-        raise Failure(f"--to {to} needs {exporter.package}: {install}", 2) from None
+        raise Failure(f"--to {to} needs {package}: {install}", 2) from None
     recording = Recording(run)
     path = run / exporter.name if out is None else out
     if path.exists():

@@ -16,7 +16,7 @@ model, in the frame `world`. Time stamps are simulated time, counted from `epoch
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,11 +35,12 @@ from rack.tools.console.answer import Document
 from rack.tools.recording.signal import list_signals
 
 if TYPE_CHECKING:
+    import mujoco
+
     from rack.levels.robot.cell import Cell
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """Types of ROS 2 Jazzy. Others may be registered."""
-LOG = "rcl_interfaces/msg/Log"
 WORLD = "world"
 STATUS_S = 0.02
 """Simulated time between two poses, or between two statuses of a board."""
@@ -55,7 +56,7 @@ SEVERITIES = {"fault": 30, "detection": 30, "miss": 30, "died": 40}
 """Severity of each kind of event in a `Log`. Other events are of severity 20, "info"."""
 
 Rows = np.ndarray
-Converter = Callable[[Rows], Iterator[tuple[int, Any]]]
+Converter = Callable[[Any], Iterator[tuple[int, Any]]]
 """Converts rows to messages of `STORE`, each with its tick, oldest first."""
 
 
@@ -92,12 +93,15 @@ class RosEncoder:
 
     Attributes:
         sources: Topics with their rings. Several sources may have the same topic or ring.
+        log: The topic of the events, given as in events.jsonl. It has no ring.
     """
 
     def __init__(self, layout: Layout, config: RackConfig, epoch_ns: int = 0) -> None:
         self._layout = layout
         self._epoch_ns = epoch_ns
         self.sources = [*self._list_sources(config)]
+        log = RosTopic("/rosout", "rcl_interfaces/msg/Log")
+        self.log = RosSource("", log, self._convert_events)
 
     def _list_sources(self, config: RackConfig) -> Iterator[RosSource]:
         """Yield the sources of tasks, then those of mailboxes."""
@@ -119,23 +123,11 @@ class RosEncoder:
                 cell = build_rack_cell(config)
                 yield RosSource(box.name, topic, partial(self._convert_poses, cell))
 
-    def encode(self, source: RosSource, rows: Rows) -> Iterator[RosMessage]:
-        """Yield the messages that rows of the source's ring become, oldest first."""
+    def encode(self, source: RosSource, rows: Any) -> Iterator[RosMessage]:
+        """Yield the messages that rows of the source's ring, or events, become, oldest first."""
         for tick, message in source.convert(rows):
-            yield self._encode_message(tick, source.topic, message)
-
-    def encode_event(self, event: Document) -> RosMessage:
-        """Encode an event of the run, given as in events.jsonl."""
-        tick, kind = event["tick"], event["kind"]
-        source = event["board"] or self._layout.rack
-        text = f"{kind}: {event['text']}"
-        stamp = self.build_header(tick).stamp
-        log = build(LOG, stamp, SEVERITIES.get(kind, 20), source, text, "", event["code"], 0)
-        return self._encode_message(tick, RosTopic("/rosout", LOG), log)
-
-    def _encode_message(self, tick: int, topic: RosTopic, message: Any) -> RosMessage:
-        data = STORE.serialize_cdr(message, topic.type_name)
-        return RosMessage(self.compute_time(tick), topic, data)
+            data = STORE.serialize_cdr(message, source.topic.type_name)
+            yield RosMessage(self.compute_time(tick), source.topic, data)
 
     def compute_time(self, tick: int) -> int:
         """Return the time stamp of a tick, in ns."""
@@ -145,6 +137,16 @@ class RosEncoder:
         """Return a `std_msgs/msg/Header` with the time stamp of a tick."""
         stamp = build("builtin_interfaces/msg/Time", *divmod(self.compute_time(tick), 10**9))
         return build("std_msgs/msg/Header", stamp, frame)
+
+    def _convert_events(self, events: Iterable[Document]) -> Iterator[tuple[int, Any]]:
+        """Yield a `Log` for each event of the run."""
+        for event in events:
+            # The tick of events before the run is -1.
+            tick, kind = max(0, event["tick"]), event["kind"]
+            source = event["board"] or self._layout.rack
+            text = f"{kind}: {event['text']}"
+            head = self.build_header(tick).stamp, SEVERITIES.get(kind, 20)
+            yield tick, build(self.log.topic.type_name, *head, source, text, "", event["code"], 0)
 
     def _convert_joints(self, robot: RobotConfig, rows: Rows) -> Iterator[tuple[int, Any]]:
         """Yield a `JointState` for each status of the arm. The gripper's joint comes last."""
@@ -165,7 +167,7 @@ class RosEncoder:
         from rack.levels.robot.engine import view_state
 
         model, data = cell.model, cell.build_start_data()
-        frames = [model.body(body).name or f"body_{body}" for body in range(1, model.nbody)]
+        _, *frames = list_frames(model)
         for row in self._select_rows(rows):
             view_state(model, data, row["message"]["state"])
             mujoco.mj_kinematics(model, data)
@@ -235,6 +237,11 @@ class RosEncoder:
     def _count_intervals(self, rows: Rows, seconds: float) -> Rows:
         """Return the number of whole intervals of simulated time before each row."""
         return np.asarray(rows["tick"] // max(1, round(seconds * 1e9 / self._layout.clock_ns)))
+
+
+def list_frames(model: mujoco.MjModel) -> list[str]:
+    """Return the name of the frame of each body."""
+    return [WORLD, *(model.body(body).name or f"body_{body}" for body in range(1, model.nbody))]
 
 
 def build(type_name: str, *values: Any) -> Any:

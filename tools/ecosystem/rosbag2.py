@@ -56,7 +56,7 @@ def export_bag(recording: Recording, path: Path, show_progress: Callable[[float]
     mailboxes = MailboxEncoder(encoder)
     events = [event for event in recording.events if event.get("tick", -1) >= 0]
     streams = [
-        map(encoder.encode_event, events),
+        encoder.encode(encoder.log, events),
         *(mailboxes.encode(box, recording.read_rows(box.name)) for box in boxes),
         *(
             encoder.encode(source, recording.read_rows(source.ring))
@@ -107,11 +107,12 @@ class MailboxEncoder:
         self.store = get_typestore(Stores.ROS2_JAZZY)
         self.definitions: dict[str, str] = {}
         self._encoder = encoder
+        self._owners: dict[str, str] = {}
 
     def encode(self, box: MailboxSpec, rows: np.ndarray) -> Iterator[RosMessage]:
         """Yield the messages of a mailbox, oldest first. The type is declared before the first."""
         # Messages of one name may have different fields, as those of bus adapters do.
-        type_name = name_type(box.name)
+        type_name = self._name_type(box.name)
         head = ["std_msgs/Header header", *(f"int64 message_{name}" for name in HEAD)]
         definition = self._declare_type(box.name, box.fields, head)
         header, _ = self.store.generate_msgdef(HEADER, ros_version=2)
@@ -133,7 +134,7 @@ class MailboxEncoder:
         """Register the type of a message, and the types of its groups.
 
         Args:
-            message: Name of the mailbox, or of the group: that of the mailbox and the field.
+            message: Name of the mailbox, or of the group, `MAILBOX/FIELD`.
             fields: Its fields.
             head: Definitions of fields that come first.
 
@@ -146,8 +147,8 @@ class MailboxEncoder:
             kind = np.dtype(field.kind)
             base = {"S": "string", "b": "bool"}.get(kind.kind, kind.name)
             if field.fields:
-                group = f"{message}_{field.name}"
-                base = name_type(group).replace("/msg", "")
+                group = f"{message}/{field.name}"
+                base = self._name_type(group).replace("/msg", "")
                 groups += f"{SEPARATOR}\nMSG: {base}\n{self._declare_type(group, field.fields)}"
             lines += [
                 f"{base} {field.name.upper()}_{name.upper()}={value}"
@@ -156,7 +157,7 @@ class MailboxEncoder:
             array = "[]" if field.shape else ""
             lines.append(f"{base}{array} {field.name}  # {field.meaning} [{field.unit}]")
         definition = "\n".join(lines) + "\n"
-        self.store.register(get_types_from_msg(definition, name_type(message)))
+        self.store.register(get_types_from_msg(definition, self._name_type(message)))
         return definition + groups
 
     def _build(
@@ -174,7 +175,7 @@ class MailboxEncoder:
         for field in fields:
             items: Any = records[field.name].reshape(-1)
             if field.fields:
-                items = self._build(f"{message}_{field.name}", field.fields, items, ())
+                items = self._build(f"{message}/{field.name}", field.fields, items, ())
             elif items.dtype.kind == "S":
                 items = [text.decode("ascii", "replace") for text in items.tolist()]
             elif not field.shape:
@@ -183,11 +184,14 @@ class MailboxEncoder:
                 size = len(items) // len(records)
                 items = [items[first : first + size] for first in range(0, len(items), size)]
             columns.append(items)
-        kind = self.store.types[name_type(message)]
+        kind = self.store.types[self._name_type(message)]
         return [kind(*values) for values in zip(*columns, strict=True)]
 
-
-def name_type(message: str) -> str:
-    """Return the name of the type of a mailbox: `rack_msgs/msg/WorldModel` for `world.model`."""
-    words = re.split(r"[\W_]+", message)
-    return f"rack_msgs/msg/{''.join(word.capitalize() for word in words)}"
+    def _name_type(self, message: str) -> str:
+        """Return the type of a mailbox or group: `rack_msgs/msg/WorldModel` for `world.model`."""
+        words = re.split(r"[\W_]+", message)
+        name = f"rack_msgs/msg/{''.join(word.capitalize() for word in words)}"
+        # `a.b_c` and `a_b.c` have the same words.
+        while self._owners.setdefault(name, message) != message:
+            name += "X"
+        return name

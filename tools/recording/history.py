@@ -115,14 +115,6 @@ def summarize_steal(recording: Recording) -> Document:
     return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
 
 
-def summarize_frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
-    """Return a dictionary from core to its lowest and highest frequency in MHz.
-
-    Returns None if no frequency was measured.
-    """
-    return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
-
-
 def list_holds(recording: Recording) -> list[Document]:
     """List every hold of every level, earliest first.
 

@@ -107,10 +107,6 @@ class TimeShift:
         by_ns = np.interp(stamps_ns - self.at_ns[0], self.at_ns - self.at_ns[0], self.by_ns - first)
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
-    def swap_machines(self) -> TimeShift:
-        """Return the offset for the opposite direction, from the second machine to the first."""
-        return TimeShift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
-
 
 class TimeLineNote(NamedTuple):
     """A note to the user, which is shown at a tick of the time line."""
@@ -273,7 +269,9 @@ def _find_shift(grid: RackGrid, line: RackGrid) -> TimeShift | None:
             continue
         if not grid.is_lockstep:
             if (shift := _read_offset(observer, mailbox, peer)) is not None:
-                shifts.append(shift if observer is line else shift.swap_machines())
+                if observer is not line:
+                    shift = TimeShift(shift.at_ns - shift.by_ns, -shift.by_ns, shift.uncertainty_ns)
+                shifts.append(shift)
         elif Presence.THERE in observer.recording.read_signal(mailbox, "presence"):
             return None
     if not shifts:

@@ -32,7 +32,6 @@ from rack.tools.recording.history import (
     list_fired_rows,
     list_holds,
     list_misses,
-    summarize_frequency,
     summarize_gaps,
     summarize_steal,
 )
@@ -111,7 +110,10 @@ def build_report(recording: Recording) -> Document:
         misses=add_causes(recording, missed_cycles, absent),
         steal=summarize_steal(recording),
         stalls=asdict(stalls),
-        frequency_mhz=summarize_frequency(recording),
+        frequency_mhz={
+            str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz
+        }
+        or None,
         notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
         holds=list_holds(recording),
         state_tables=list_fired_rows(recording),

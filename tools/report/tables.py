@@ -128,11 +128,9 @@ def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
         yield "--verbose shows every level, task and equation"
         return
     yield ""
-    yield (
-        f"Levels: processor time in ms, {_format_percentile(analysis.percentile)}; "
-        "t_residual is alpha of"
-        " eq. 3.6."
-    )
+    percentile = analysis.percentile
+    which = "the worst cycle" if percentile >= 100 else f"{percentile:g} of 100 cycles"
+    yield f"Levels: processor time in ms, in {which}; t_residual is alpha of eq. 3.6."
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
     names = analysis.recording.rack_config.board
     yield build_level_table(
@@ -151,11 +149,6 @@ def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
         for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))
         if verdict is not None
     )
-
-
-def _format_percentile(percentile: float) -> str:
-    """Return a clause that says which cycles a percentile covers."""
-    return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:

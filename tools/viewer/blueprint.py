@@ -146,7 +146,7 @@ class RackViews:
         below = rrb.Tabs(
             self._build_level_lanes("levels, whole run"),
             self._build_event_lanes(),
-            self._build_graph(),
+            rrb.GraphView(origin=self.build_path(HIERARCHY), name="hierarchy"),
             active_tab=0,
         )
         left: rrb.Container = below
@@ -372,10 +372,6 @@ class RackViews:
             _build_plot("plan age, ms", plans),
             self._build_unit_plots("signals", self._layout.mailboxes),
         )
-
-    def _build_graph(self) -> rrb.View:
-        """Return the view of the hierarchy of levels as a graph."""
-        return rrb.GraphView(origin=self.build_path(HIERARCHY), name="hierarchy")
 
 
 def _build_lane_columns(

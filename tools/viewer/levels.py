@@ -77,18 +77,19 @@ def format_serial(serial: int) -> str:
     return str(serial) if serial else ""
 
 
-def format_move(move: tuple[int, int]) -> str:
-    """Format a move, given as serial and verb. Returns "" for serial 0, which means no move."""
-    return format_enum(Verb, move[1]) if move[0] else ""
-
-
 def format_enum(kind: type[IntEnum], number: int) -> str:
     """Return the name of an enum member with this number, in lower case and with spaces."""
     return kind(number).name.lower().replace("_", " ")
 
 
 VALUE_LANES: tuple[tuple[type[Message], ValueLane], ...] = (
-    (MoveStatus, ValueLane("move", ["current", "verb"], format_move)),
+    (
+        MoveStatus,
+        # A move of serial 0 means no move.
+        ValueLane(
+            "move", ["current", "verb"], lambda move: format_enum(Verb, move[1]) if move[0] else ""
+        ),
+    ),
     (MotionStatus, ValueLane("request", "current", format_serial)),
     (ServerStatus, ValueLane("request", "current", format_serial)),
     (

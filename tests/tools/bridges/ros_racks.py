@@ -17,7 +17,17 @@ from rack.backplane.words import System
 from tests.processes import RACK, children_of, wait_until
 from tests.tools.command_line import BOUND_S, rack
 
-PEER = Path(__file__).with_name("ros_peer.py")
+FOLDER = Path(__file__).parent
+LOOPBACK = """
+<CycloneDDS><Domain>
+  <General>
+    <Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>
+  </General>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>
+  </Discovery>
+</Domain></CycloneDDS>
+"""
 
 
 @dataclass
@@ -45,13 +55,35 @@ def ros_peer(folder: Path) -> Iterator[Peer]:
         "scouting": {"multicast": {"enabled": False}},
     }
     config.write_text(json.dumps(settings))
-    command = [sys.executable, PEER, place]
+    environment = {"ZENOH_SESSION_CONFIG_URI": str(config), "ROS_DOMAIN_ID": "42"}
+    with _peer("ros_peer.py", [place], environment) as peer:
+        yield peer
+
+
+@contextmanager
+def dds_peer() -> Iterator[Peer]:
+    """Start another node with DDS, to which nodes with the yielded environment connect."""
+    environment = {
+        "CYCLONEDDS_URI": LOOPBACK,
+        "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp",
+        # Other tests of this machine use other domains.
+        "ROS_DOMAIN_ID": str(os.getpid() % 200 + 10),
+    }
+    with _peer("dds_peer.py", [], environment) as peer:
+        yield peer
+
+
+@contextmanager
+def _peer(script: str, words: Sequence[str], environment: Mapping[str, str]) -> Iterator[Peer]:
+    """Run a node in a process of its own."""
+    command = [sys.executable, FOLDER / script, *words]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **environment}
+    ) as process:
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == '{"open": true}\n'
-            environment = {"ZENOH_SESSION_CONFIG_URI": str(config), "ROS_DOMAIN_ID": "42"}
             yield Peer(process, environment)
         finally:
             process.kill()

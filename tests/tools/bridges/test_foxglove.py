@@ -89,7 +89,7 @@ def connect_to(held: HeldRack) -> ClientConnection:
 def test_a_client_gets_scene_curves_timing_and_log(shown: HeldRack) -> None:
     with connect_to(shown) as socket:
         client = Client(socket)
-        wanted = {"/cell", "/tf", "/joint_states", "/log", "/timing/servo", "/diagnostics"}
+        wanted = {"/cell", "/tf", "/joint_states", "/rosout", "/timing/servo", "/diagnostics"}
         for _ in range(50):
             client.receive()
             if wanted <= client.messages.keys():
@@ -109,7 +109,7 @@ def test_a_client_gets_scene_curves_timing_and_log(shown: HeldRack) -> None:
         assert {entity.frame_id for entity in scene.entities} <= {*frames, "world"}
         assert client.decode("/joint_states").name[:2] == ["j1", "j2"]
         assert client.decode("/timing/servo")["response_ms"] > 0
-        assert client.decode("/log").message
+        assert client.decode("/rosout").msg
         assert {"/rack/servo/status", "/timing/world"} <= client.channels.keys()
 
 

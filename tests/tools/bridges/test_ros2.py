@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from collections import defaultdict
 from collections.abc import Iterator
@@ -11,16 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ruamel.yaml import YAML
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import list_racks
 from rack.tools.monitor.newest_messages import NewestMessages
+from tests.pages import ROOT
 from tests.processes import runs, wait_until
 from tests.tools.bridges.ros_racks import HeldRack, Peer, held_rack, ros_peer
 from tests.tools.command_line import BOUND_S, rack
 
 pytestmark = pytest.mark.slow
 PUMA = ["j1", "j2", "j3", "j4", "j5", "j6"]
+PAGE = ROOT / "tools" / "NEIGHBOURS.md"
 EXTERNAL = ("chimera", "--set", "host.command.external=true", "--ros2")
 
 
@@ -128,9 +132,15 @@ def test_trajectories_move_an_arm_and_are_replayed(
     peer: Peer, rack_name: str, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    goal = [0.3, 1.1, -2.7, 0.1, -1.3, 0.2]
+    # The message of the page, with a point before it, and with the joints in another order.
+    (line,) = re.findall(r'ros2 topic pub .*JointTrajectory "(.*?)"', PAGE.read_text(), re.DOTALL)
+    message = YAML(typ="safe").load(line)
+    assert message["joint_names"] == PUMA
+    (point,) = message["points"]
+    goal = point["positions"]
     swapped = [*PUMA[:0:-1], PUMA[0]]
-    points = [(0.5, [0.1, -1.4, 0.05, -2.9, 1.3, 0.1]), (1.25, [*goal[:0:-1], goal[0]])]
+    last = point["time_from_start"]["sec"], [*goal[:0:-1], goal[0]]
+    points = [(0.5, [0.1, -1.4, 0.05, -2.9, 1.3, 0.1]), last]
     with held_rack(tmp_path, rack_name, (*EXTERNAL, "--out", run), peer.environment) as held:
         wait_until(lambda: peer.ask("is_followed"), BOUND_S)
         peer.ask("move", joints=swapped, points=points)
@@ -144,11 +154,14 @@ def test_trajectories_move_an_arm_and_are_replayed(
         assert status.position.tolist() == pytest.approx(goal, abs=1e-6)
         mistakes: list[tuple[dict[str, Any], str]] = [
             ({"joints": ["elbow"], "points": []}, 'joint_names = "elbow": must be j1, j2'),
-            ({"joints": PUMA, "points": [(1.0, [0.0])]}, "points[0].positions: must be 6"),
+            (
+                {"joints": PUMA, "points": [(1.0, [0.0])]},
+                "points[0].positions has length 1: must be 6",
+            ),
             ({"joints": PUMA, "points": [(1.0, goal), (1.0, goal)]}, "points[1].time_from_start"),
         ]
-        for message, why in mistakes:
-            insist(held, peer, f"ros2: /joint_trajectory: {why}", "move", **message)
+        for mistake, why in mistakes:
+            insist(held, peer, f"ros2: /joint_trajectory: {why}", "move", **mistake)
         held.step(200)
         assert newest.read_message("trajectory.status").done == status.done
     (repeated,) = repeat(run, tmp_path)
@@ -183,6 +196,8 @@ def test_floods_and_other_types_are_one_line_each(
         peer.ask("put", hex="00010000ffffffffffffffff", times=2000)
         held.wait_for("/joint_trajectory: 12 bytes are not a trajectory_msgs/msg/JointTrajectory")
         assert held.log.read_text().count("12 bytes are not") <= 5
-        insist(held, peer, "RIHS01_00 is of another type or version", "put", key=other, hex="00")
+        insist(
+            held, peer, f"of another type or version: {other}; valid: ", "put", key=other, hex="00"
+        )
         held.step(100)
         assert runs(held.find_bridge())

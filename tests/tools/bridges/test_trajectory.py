@@ -9,9 +9,9 @@ from typing import Any
 import mujoco
 import pytest
 
-from rack.tools.bridges.ros_node import RosType
 from rack.tools.bridges.scene import build_scene
 from rack.tools.bridges.trajectory import MAX_BYTES, TYPE, read_trajectory
+from rack.tools.bridges.zenoh_node import build_key
 from rack.tools.ecosystem.ros_messages import STORE, build
 
 JOINTS = ("a", "b")
@@ -33,19 +33,23 @@ MODEL = """
 """
 
 
-def encode(names: Sequence[str], *points: tuple[float, Sequence[float]]) -> bytes:
+def encode(
+    names: Sequence[str],
+    *points: tuple[float, Sequence[float]],
+    velocities: Sequence[float] = (),
+    accelerations: Sequence[float] = (),
+    effort: Sequence[float] = (),
+) -> bytes:
     """Encode a trajectory."""
     import numpy as np
 
     header = build("std_msgs/msg/Header", build("builtin_interfaces/msg/Time", 0, 0), "")
-    empty = np.array([])
+    others = [np.array(values, float) for values in (velocities, accelerations, effort)]
     made = [
         build(
             "trajectory_msgs/msg/JointTrajectoryPoint",
             np.array(positions, float),
-            empty,
-            empty,
-            empty,
+            *others,
             build("builtin_interfaces/msg/Duration", int(at // 1), round(at % 1 * 1e9)),
         )
         for at, positions in points
@@ -55,8 +59,15 @@ def encode(names: Sequence[str], *points: tuple[float, Sequence[float]]) -> byte
 
 def test_points_are_in_the_order_of_the_arm() -> None:
     points = read_trajectory(encode(("b", "a"), (0.5, (2, 1)), (1.25, (4, 3))), JOINTS)
-    assert points == [(0.5, [1.0, 2.0]), (1.25, [3.0, 4.0])]
-    assert read_trajectory(encode(JOINTS), JOINTS) == []
+    assert points == ([(0.5, [1.0, 2.0]), (1.25, [3.0, 4.0])], [])
+    assert read_trajectory(encode(JOINTS), JOINTS) == ([], [])
+
+
+def test_values_that_are_not_followed_are_named() -> None:
+    moving = encode(JOINTS, (1, (0, 0)), velocities=(0.0, 0.5), accelerations=(1.0, 0.0))
+    assert read_trajectory(moving, JOINTS).ignored == ["velocities", "accelerations"]
+    # A trajectory that only asks for rest at its points asks for nothing that is ignored.
+    assert read_trajectory(encode(JOINTS, (1, (0, 0)), effort=(0, 0)), JOINTS).ignored == []
 
 
 @pytest.mark.parametrize(
@@ -70,7 +81,11 @@ def test_points_are_in_the_order_of_the_arm() -> None:
         (encode(("a",)), 'joint_names = "a": must be a, b, in any order'),
         (encode(("a", "a")), 'joint_names = "a, a": must be a, b'),
         (encode(("a", "b", "c")), "must be a, b"),
-        (encode(JOINTS, (1, (0,))), "points[0].positions: must be 2 numbers"),
+        (encode(JOINTS, (1, (0,))), "points[0].positions has length 1: must be 2"),
+        (
+            encode(JOINTS, (1, (0, 0)), velocities=(1.0,)),
+            "points[0].velocities has length 1: must be 2",
+        ),
         (encode(JOINTS, (1, (0, 0)), (1, (0, 0))), "points[1].time_from_start = 1 s: must rise"),
         (encode(JOINTS, (-1, (0, 0))), "points[0].time_from_start = -1 s: must rise from 0"),
     ],
@@ -81,8 +96,7 @@ def test_a_wrong_message_is_refused_with_its_place(data: bytes, why: str) -> Non
 
 
 def test_a_key_has_the_names_of_rmw_zenoh() -> None:
-    hashed = STORE.hash_rihs01("sensor_msgs/msg/JointState")
-    assert RosType("sensor_msgs/msg/JointState", hashed).key == (
+    assert build_key("sensor_msgs/msg/JointState") == (
         "sensor_msgs::msg::dds_::JointState_/"
         "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
     )

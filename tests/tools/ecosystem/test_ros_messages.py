@@ -120,7 +120,8 @@ def test_no_rows_become_no_messages(layout: Layout, encoder: RosEncoder) -> None
 )
 def test_events_become_entries_of_the_log(encoder: RosEncoder, kind: str, severity: int) -> None:
     event = {"kind": kind, "board": "", "tick": 400, "text": "it happened", "code": "code"}
-    log = decode(encoder.encode_event(event))
+    (message,) = encoder.encode(encoder.log, [event])
+    log = decode(message)
     assert (log.level, log.name, log.msg) == (severity, "small", f"{kind}: it happened")
     assert (log.stamp.sec, log.function) == (1_700_000_001, "code")
 

@@ -219,6 +219,28 @@ def test_messages_of_one_name_may_have_different_fields(small: Path) -> None:
     }
 
 
+def test_mailboxes_whose_names_have_the_same_words_have_types_of_their_own(small: Path) -> None:
+    config = load(small, [])
+    layout = resolve_layout(config)
+    mailboxes = MailboxEncoder(RosEncoder(layout, config))
+    box = layout.find_mailbox("lower.status")
+    found = {}
+    for name, fields in (("a.b_c", box.fields), ("a_b.c", box.fields[1:]), ("aB.c", box.fields)):
+        named = replace(box, name=name, fields=fields)
+        (message,) = mailboxes.encode(named, np.zeros(1, build_row_dtype(named)))
+        found[message.topic] = mailboxes.store.deserialize_cdr(
+            message.data, message.topic.type_name
+        )
+    assert [topic.name for topic in found] == ["/mailbox/a/b_c", "/mailbox/a_b/c", "/mailbox/aB/c"]
+    assert [topic.type_name for topic in found] == [
+        "rack_msgs/msg/ABC",
+        "rack_msgs/msg/ABCX",
+        "rack_msgs/msg/AbC",
+    ]
+    first = box.fields[0].name
+    assert [hasattr(message, first) for message in found.values()] == [True, False, True]
+
+
 def test_a_run_without_messages_is_refused(small: Path, tmp_path: Path) -> None:
     empty = recorded(tmp_path / "run", load(small, []), {})
     with pytest.raises(Failure, match="no message is recorded") as caught:
