@@ -22,7 +22,13 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
 from rack.tools.faults.campaigns.environment import check_violation_counter, run_load
-from rack.tools.faults.campaigns.plan import Plan, Targets, needs_real_time, select_kinds
+from rack.tools.faults.campaigns.plan import (
+    NOMINAL,
+    Plan,
+    Targets,
+    needs_real_time,
+    select_kinds,
+)
 from rack.tools.faults.campaigns.results import FaultlessTime, Results, TrialResult, load_result
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from rack.tools.faults.ending import EXTERNAL, find_record
@@ -41,7 +47,6 @@ The number grows from round to round: the fewer faults are missing, the less an 
 ORDER = "order.json"
 TRIALS = "trials"
 """Names of the file with the order, and of the folder of trials, in a campaign's folder."""
-NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
 @dataclass(frozen=True)

@@ -15,19 +15,20 @@ from rack.tools.faults.judge import Circumstances, Judge, Judgement, find_end
 class EarlyEnd:
     """Ends a lockstep trial as soon as no later event can change the verdict on any fault.
 
-    It holds the rack before the ticks at which all verdicts may have become final.
+    It holds the rack before the ticks at which all verdicts may have become final, first before
+    `tick`, at which the last fault begins.
 
     Attributes:
         is_reached: Whether the trial was ended.
     """
 
-    def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
+    def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances, tick: int) -> None:
         self.is_reached = False
         self._rack = rack
         self._joints = joints
         self._run = run
         self._words = rack.segment.words
-        self._hold_before(max(0, rack.begins_at))
+        self._hold_before(max(tick, rack.begins_at))
 
     def evaluate_if_held(self) -> None:
         """If the rack is held, end the trial if all verdicts are final, or continue it."""

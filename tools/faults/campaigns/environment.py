@@ -43,10 +43,11 @@ def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
     Returns:
         A text for each: the path of a segment or semaphore, or id and name of a process.
     """
-    await_ends({*_find_board_processes(rack), *(list_living_descendants() - pids_before)}, BOUND_S)
     processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
+    await_ends(processes, BOUND_S)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
-    return files + [f"process {pid} ({_read_name(pid)})" for pid in sorted(processes)]
+    living = filter(is_alive, sorted(processes))
+    return files + [f"process {pid} ({_read_name(pid)})" for pid in living]
 
 
 def _find_board_processes(rack: str) -> set[int]:

@@ -98,6 +98,9 @@ class Plan:
         return "\n".join([head, *kills, "", faults])
 
 
+NOMINAL = Plan(0, "nominal", lockstep=True)
+
+
 def needs_real_time(kind: str) -> bool:
     """Return True if faults of a kind are not useful in lockstep.
 

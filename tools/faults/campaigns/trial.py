@@ -20,10 +20,10 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event, Outcome, iterate_statuses
+from rack.boards.events import OF_LAUNCH, Event, Outcome, iterate_statuses
 from rack.boards.faults.bounds import list_affected_mailboxes
+from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.levels.messages import Error
-from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.certainty import EarlyEnd
 from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
 from rack.tools.faults.campaigns.plan import Kill, Plan
@@ -41,10 +41,10 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-HELD_S = 0.004
+HELD_S = 0.01
 """Interval at which a rack that may be held is checked."""
-RERUN_S = 2.0
-"""Simulated time of the run after a refused launch, in which each task has some cycles."""
+RERUN_S = 0.25
+"""Simulated time of the run after a refused launch."""
 
 
 class Killer:
@@ -122,6 +122,26 @@ def build_external_kill(layout: Layout, board: str, tick: int, time_ns: int) -> 
     )
 
 
+@dataclass(frozen=True)
+class Start:
+    """Starting point of a trial.
+
+    Attributes:
+        tick: Tick before which the trial starts.
+        whole: Why the trial does not continue from a snapshot. Empty if it does, and for the
+            faultless run.
+        continues: The snapshot from which to continue. None for a whole run.
+        snapshots: When the trial takes snapshots. None for no snapshots.
+        events: Events of the faultless run that the trial continues.
+    """
+
+    tick: int = 0
+    whole: str = ""
+    continues: Continuation | None = None
+    snapshots: SnapshotPolicy | None = None
+    events: tuple[Event, ...] = ()
+
+
 @dataclass
 class Trial:
     """A trial that was run.
@@ -166,13 +186,13 @@ def run_trial(
     ticks: int,
     seconds: float | None,
     *,
-    base: BaseRack | None = None,
+    start: Start = Start(),
     crate: WarmCrate | None = None,
 ) -> Trial:
     """Run a plan and return the data for its evaluation.
 
-    If possible, the trial continues from a snapshot of the faultless rack. It then ends as soon as
-    the verdict on each of its faults is certain.
+    A trial that continues from a snapshot ends as soon as the verdict on each of its faults is
+    certain.
 
     Args:
         config: Config of the rack, without faults.
@@ -180,26 +200,36 @@ def run_trial(
         rack_name: Name of the rack.
         ticks: Length of a faultless run in ticks. 0 if unknown.
         seconds: Simulated time in s after which the run ends if no task ends it.
-        base: Faultless rack. None to run the whole trial.
+        start: Starting point of the trial.
         crate: Crate that runs the rack and has the snapshots. None to start a new one.
 
     Raises:
         ConfigError: The plan does not fit the config.
     """
-    start = Start(whole="as asked") if base is None else base.find_start(plan, crate, seconds)
     trial = Trial(plan)
     pids_before = list_living_descendants()
     started = time.monotonic()
-    rack = Rack(plan.to_config(config, rack_name), crate=crate, continues=start.continues)
+    rack = Rack(
+        plan.to_config(config, rack_name),
+        crate=crate,
+        snapshots=start.snapshots,
+        continues=start.continues,
+    )
     try:
         with rack:
-            start = start.resolve_snapshot(rack.begins_at)
-            rack.events.extend(start.events)
+            begin = max(0, rack.begins_at)
+            start = replace(start, tick=begin)
+            rack.events.extend(
+                event
+                for event in start.events
+                if event.tick < begin and event.kind not in OF_LAUNCH
+            )
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
             certainty = None
             if start.continues is not None and not plan.kills:
-                certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan))
+                last_tick = max(table["tick"] for table in plan.faults)
+                certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan), last_tick)
             _watch_run(rack, killer, ticks, seconds, certainty)
             trial.is_cut = certainty is not None and certainty.is_reached
             trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)

@@ -20,9 +20,9 @@ from rack.boards.crate.line import WarmCrate
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.base import BaseRack
-from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.plan import NOMINAL, Plan
 from rack.tools.faults.campaigns.results import save_result
-from rack.tools.faults.campaigns.trial import run_trial
+from rack.tools.faults.campaigns.trial import Start, run_trial
 
 LOOK_S = 0.2
 """Maximum time until a waiting campaign notices an interrupt."""
@@ -90,11 +90,16 @@ class Workers:
         """
         waiting = list(jobs)
         busy = dict[Future[str], TrialJob]()
+        spare = list[Future[str]]()
         max_busy = 1 if alone else self._most
         while (waiting or busy) and not INTERRUPT.number:
             while waiting and len(busy) < max_busy:
                 job = waiting.pop(0)
                 busy[self._pool.submit(_run_job, job)] = job
+                if job.plan == NOMINAL:
+                    # The other workers are idle. They run it for the snapshots.
+                    for _ in range(self._most - 1):
+                        spare.append(self._pool.submit(_run_job, job))
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job = busy.pop(future)
@@ -105,8 +110,9 @@ class Workers:
                 if error_text:
                     raise Failure(f"trial {job.plan.number} failed: {error_text}")
                 yield job
-        if busy:
+        if INTERRUPT.number:
             self._stop()
+        wait(spare)
 
     def _stop(self) -> None:
         """Terminate the workers. The racks of their trials are removed without being stopped."""
@@ -133,10 +139,15 @@ class TrialRunner:
         is_lockstep = job.plan.lockstep
         os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
         crate = self._prepare_crate(is_lockstep)
-        base = None if self._whole else self._base
-        name = self._base.name
+        base = self._base
+        start = Start(whole="as asked")
+        if not self._whole:
+            if crate is not None and job.plan == NOMINAL:
+                save_result(base.run_once(crate, job.seconds), job.path)
+                return
+            start = base.find_start(job.plan, crate, job.seconds)
         trial = run_trial(
-            self._config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
+            self._config, job.plan, base.name, job.ticks, job.seconds, start=start, crate=crate
         )
         save_result(trial, job.path)
 

@@ -15,11 +15,11 @@ from rack.boards.config import RackConfig, load, resolve_layout
 from rack.boards.crate.line import WarmCrate
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.campaigns import base as base_rack
-from rack.tools.faults.campaigns.base import BaseRack, Start
+from rack.tools.faults.campaigns.base import BaseRack
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans
-from rack.tools.faults.campaigns.plan import Kill, Plan, Targets, needs_real_time
+from rack.tools.faults.campaigns.plan import NOMINAL, Kill, Plan, Targets, needs_real_time
 from rack.tools.faults.campaigns.results import judge_trial
-from rack.tools.faults.campaigns.trial import Trial, run_trial
+from rack.tools.faults.campaigns.trial import Start, Trial, run_trial
 from tests.conftest import EXHAUSTIVE
 
 SECONDS = 5.0
@@ -46,9 +46,12 @@ class Bench:
         self.base = BaseRack(self._config, name)
         self.crate = crate
 
-    def run(self, plan: Plan, whole: bool = False) -> Trial:
-        base, name = None if whole else self.base, self.base.name
-        return run_trial(self._config, plan, name, 0, SECONDS, base=base, crate=self.crate)
+    def run(self, plan: Plan, whole: bool = False, seconds: float = SECONDS) -> Trial:
+        """Run a plan."""
+        start = Start() if whole else self.base.find_start(plan, self.crate, seconds)
+        return run_trial(
+            self._config, plan, self.base.name, 0, seconds, start=start, crate=self.crate
+        )
 
 
 def verdict(trial: Trial) -> dict[str, Any]:
@@ -130,6 +133,18 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
         again = bench.run(plan)
         assert again.outcome is not None
         assert again.outcome.ticks == continued.outcome.ticks
+
+
+@pytest.mark.slow
+def test_the_faultless_rack_runs_once_in_each_crate_and_equals_one_without_snapshots(
+    bench: Bench,
+) -> None:
+    first = bench.base.run_once(bench.crate, SECONDS)
+    assert bench.base.run_once(bench.crate, SECONDS) is first
+    whole = bench.run(NOMINAL, whole=True)
+    assert first.outcome is not None
+    assert whole.outcome is not None
+    assert (first.outcome.digest, first.left) == (whole.outcome.digest, ())
 
 
 @pytest.mark.slow
