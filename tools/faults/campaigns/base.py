@@ -7,6 +7,8 @@ same as if it had begun at tick 0.
 
 from __future__ import annotations
 
+import sys
+
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX
@@ -29,15 +31,15 @@ class BaseRack:
         self._config = config
         self._crate: WarmCrate | None = None
         self._trial = Trial(NOMINAL)
+        self._reached = 0
         self._why_none = config.outside_state
 
-    def find_start(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
-        """Return the starting point of a trial. Run the faultless rack first if necessary.
+    def find_start(self, plan: Plan, crate: WarmCrate | None) -> Start:
+        """Return the starting point of a trial. Run the faultless rack up to there if necessary.
 
         Args:
             plan: Plan of the trial.
             crate: Crate of the worker. None if it has none.
-            seconds: Simulated time in s after which the faultless run ends if no task ends it.
         """
         if not (plan.faults or plan.kills):
             return Start()
@@ -46,28 +48,47 @@ class BaseRack:
         if not plan.first_tick:
             return Start(whole="a fault prevents the launch")
         if not self._why_none:
-            self.run_once(crate, seconds)
+            # Include the tick, so that a snapshot before it is taken.
+            self.run(crate, (plan.first_tick + 1) * self._config.clock_ns * 1e-9)
         if self._why_none:
             return Start(whole=f"{NO_SNAPSHOTS_PREFIX}{self._why_none}")
-        continuation = Continuation(
-            plan.first_tick, len(self._config.fault), len(self._config.command)
-        )
-        return Start(continues=continuation, events=self._trial.events)
+        return Start(continues=self._continue_before(plan.first_tick), events=self._trial.events)
 
-    def run_once(self, crate: WarmCrate, seconds: float | None) -> Trial:
-        """Return the faultless trial. Run it unless this crate has already run it."""
+    def run(self, crate: WarmCrate, seconds: float | None) -> Trial:
+        """Return the faultless trial, run at least for a time in this crate.
+
+        The trial continues from its last snapshot if it is not long enough yet.
+
+        Args:
+            crate: Crate of the worker, which keeps the snapshots.
+            seconds: Simulated time in s after which the run ends. None to run until the task ends.
+        """
         if self._crate is not crate:
-            every = max(1, round(EVERY_S * 1e9 / self._config.clock_ns))
-            policy = None if self._why_none else SnapshotPolicy(part=0, every=every)
-            start = Start(snapshots=policy)
-            self._trial = run_trial(
-                self._config, NOMINAL, self.name, 0, seconds, start=start, crate=crate
-            )
             self._crate = crate
-            reasons = (
-                event.text.removeprefix(NO_SNAPSHOTS_PREFIX)
-                for event in self._trial.events
-                if event.text.startswith(NO_SNAPSHOTS_PREFIX)
+            self._reached = 0
+        ticks = sys.maxsize if seconds is None else round(seconds * 1e9 / self._config.clock_ns)
+        if self._reached >= ticks:
+            return self._trial
+        every = max(1, round(EVERY_S * 1e9 / self._config.clock_ns))
+        start = Start()
+        if not self._why_none:
+            start = Start(
+                continues=self._continue_before(self._reached) if self._reached else None,
+                snapshots=SnapshotPolicy(part=0, every=every),
+                events=self._trial.events,
             )
-            self._why_none = next(reasons, self._why_none)
+        self._trial = run_trial(
+            self._config, NOMINAL, self.name, 0, seconds, start=start, crate=crate
+        )
+        self._reached = ticks
+        reasons = (
+            event.text.removeprefix(NO_SNAPSHOTS_PREFIX)
+            for event in self._trial.events
+            if event.text.startswith(NO_SNAPSHOTS_PREFIX)
+        )
+        self._why_none = next(reasons, self._why_none)
         return self._trial
+
+    def _continue_before(self, tick: int) -> Continuation:
+        """Return the point from which a rack continues: the last snapshot up to a tick."""
+        return Continuation(tick, len(self._config.fault), len(self._config.command))

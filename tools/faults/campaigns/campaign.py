@@ -238,7 +238,7 @@ class Campaign:
             return
         if result.shortfalls and plan.number:
             path = self.folder / f"trial-{plan.number:04}.toml"
-            path.write_text(plan.format_faults(self.order.name))
+            path.write_text(result.actual_plan.format_faults(self.order.name))
         text = f"{_describe_plan(plan)}: {result.ended}"
         self._progress.end_run(self._estimate_s([plan]), text, result.shortfalls)
 

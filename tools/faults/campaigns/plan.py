@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -82,6 +82,11 @@ class Plan:
                 "fault": config.fault + faults,
             }
         )
+
+    def move_faults(self, ticks: Sequence[int]) -> Plan:
+        """Return a copy of the plan whose faults begin at the given ticks."""
+        moved = ({**table, "tick": tick} for table, tick in zip(self.faults, ticks, strict=True))
+        return replace(self, faults=tuple(moved))
 
     def format_faults(self, config: str) -> str:
         """Return the content of a file for `--faults` that repeats this plan.

@@ -44,6 +44,8 @@ class TrialResult:
         shortfalls: What was wrong, a line each. Empty for a successful trial.
         start: Tick of the snapshot from which the trial continued. 0 if it did not.
         whole: Why the trial did not continue from a snapshot. Empty if it did.
+        begins: Tick at which each fault of the plan began, or was due when the trial ended. Empty
+            if the trial kept to the ticks of its plan.
     """
 
     plan: Plan
@@ -62,6 +64,12 @@ class TrialResult:
     shortfalls: tuple[str, ...]
     start: int = 0
     whole: str = ""
+    begins: tuple[int, ...] = ()
+
+    @property
+    def actual_plan(self) -> Plan:
+        """The plan with the ticks at which its faults began."""
+        return self.plan.move_faults(self.begins) if self.begins else self.plan
 
 
 def judge_trial(trial: Trial) -> TrialResult:
@@ -87,6 +95,7 @@ def judge_trial(trial: Trial) -> TrialResult:
         shortfalls=_list_shortfalls(trial, verdict, ended),
         start=trial.start.tick,
         whole=trial.start.whole,
+        begins=trial.begins,
     )
 
 

@@ -24,7 +24,7 @@ from rack.boards.events import OF_LAUNCH, Event, Outcome, iterate_statuses
 from rack.boards.faults.bounds import list_affected_mailboxes
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.levels.messages import Error
-from rack.tools.faults.campaigns.certainty import EarlyEnd
+from rack.tools.faults.campaigns.pacer import Pacer
 from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, list_strikes, read_arm
@@ -41,10 +41,10 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-HELD_S = 0.01
+HELD_S = 0.004
 """Interval at which a rack that may be held is checked."""
-RERUN_S = 0.25
-"""Simulated time of the run after a refused launch."""
+RERUN_S = 2.0
+"""Simulated time of the run after a refused launch, in which each task has some cycles."""
 
 
 class Killer:
@@ -159,6 +159,7 @@ class Trial:
         levels: Last state of each level, as text.
         is_late: Whether a level ended with an error because it could not meet a time.
         again: Outcome of a second run, without the faults, after a refused launch.
+        begins: Tick at which each fault of the plan began, or was due when the run ended.
         start: Starting point of the trial.
         is_cut: Whether the trial was ended early because the verdict on each fault was certain.
     """
@@ -175,6 +176,7 @@ class Trial:
     levels: str = ""
     is_late: bool = False
     again: Outcome | None = None
+    begins: tuple[int, ...] = ()
     start: Start = field(default_factory=Start)
     is_cut: bool = False
 
@@ -191,8 +193,8 @@ def run_trial(
 ) -> Trial:
     """Run a plan and return the data for its evaluation.
 
-    A trial that continues from a snapshot ends as soon as the verdict on each of its faults is
-    certain.
+    In a trial that continues from a snapshot, each fault begins as soon as the ones before it are
+    settled, but not after its planned tick. The trial ends as soon as all verdicts are certain.
 
     Args:
         config: Config of the rack, without faults.
@@ -222,17 +224,18 @@ def run_trial(
             rack.events.extend(
                 event
                 for event in start.events
-                if event.tick < begin and event.kind not in OF_LAUNCH
+                if event.tick < begin and event.kind not in (*OF_LAUNCH, "end")
             )
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
-            certainty = None
-            if start.continues is not None and not plan.kills:
-                last_tick = max(table["tick"] for table in plan.faults)
-                certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan), last_tick)
-            _watch_run(rack, killer, ticks, seconds, certainty)
-            trial.is_cut = certainty is not None and certainty.is_reached
+            pacer = None
+            if start.continues is not None and plan.faults and not plan.kills:
+                pacer = Pacer(rack, joints, _collect_circumstances(rack, plan), plan.faults)
+            _watch_run(rack, killer, ticks, seconds, pacer)
+            trial.is_cut = pacer is not None and pacer.is_over
             trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)
+            if pacer is not None:
+                trial.begins = pacer.begins
             trial.arm = read_arm(rack.segment)
             trial.levels = format_levels(rack.segment)
             trial.is_late = is_late(rack.segment)
@@ -284,11 +287,11 @@ def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
 
 
 def _watch_run(
-    rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: EarlyEnd | None
+    rack: Rack, killer: Killer, ticks: int, seconds: float | None, pacer: Pacer | None
 ) -> None:
     """Start the run and watch it to its end. Kill boards as planned.
 
-    The run is stopped if it takes too long, or ended early if `certainty` permits it.
+    The run is stopped if it takes too long, or ended early if `pacer` does so.
     """
     rack.start(seconds)
     words = rack.segment.words
@@ -299,10 +302,10 @@ def _watch_run(
     last_tick = -1
     deadline = 0.0
     stopped = False
-    while rack.watch(killer.compute_wait_s() if certainty is None else HELD_S):
+    while rack.watch(killer.compute_wait_s() if pacer is None else HELD_S):
         killer.kill_due_board()
-        if certainty is not None:
-            certainty.evaluate_if_held()
+        if pacer is not None:
+            pacer.continue_if_held()
         now_s = time.monotonic()
         if stopped and now_s > deadline:
             return

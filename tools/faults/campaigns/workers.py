@@ -90,16 +90,11 @@ class Workers:
         """
         waiting = list(jobs)
         busy = dict[Future[str], TrialJob]()
-        spare = list[Future[str]]()
         max_busy = 1 if alone else self._most
         while (waiting or busy) and not INTERRUPT.number:
             while waiting and len(busy) < max_busy:
                 job = waiting.pop(0)
                 busy[self._pool.submit(_run_job, job)] = job
-                if job.plan == NOMINAL:
-                    # The other workers are idle. They run it for the snapshots.
-                    for _ in range(self._most - 1):
-                        spare.append(self._pool.submit(_run_job, job))
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job = busy.pop(future)
@@ -110,9 +105,8 @@ class Workers:
                 if error_text:
                     raise Failure(f"trial {job.plan.number} failed: {error_text}")
                 yield job
-        if INTERRUPT.number:
+        if busy:
             self._stop()
-        wait(spare)
 
     def _stop(self) -> None:
         """Terminate the workers. The racks of their trials are removed without being stopped."""
@@ -143,9 +137,9 @@ class TrialRunner:
         start = Start(whole="as asked")
         if not self._whole:
             if crate is not None and job.plan == NOMINAL:
-                save_result(base.run_once(crate, job.seconds), job.path)
+                save_result(base.run(crate, job.seconds), job.path)
                 return
-            start = base.find_start(job.plan, crate, job.seconds)
+            start = base.find_start(job.plan, crate)
         trial = run_trial(
             self._config, job.plan, base.name, job.ticks, job.seconds, start=start, crate=crate
         )

@@ -98,6 +98,6 @@ def test_a_rack_that_a_fault_keeps_from_launching_is_tried_without_it(
     found = run_trial(load(small), plan, rack_name, ticks=0, seconds=0.5)
     assert "lower" in found.refused
     assert found.again is not None
-    # A quarter of a second of simulated time.
-    assert (found.again.cause, found.again.ticks) == ("time over", 100)
+    # Two seconds of simulated time.
+    assert (found.again.cause, found.again.ticks) == ("time over", 800)
     assert (found.strikes, found.run) == ((), None)
