@@ -24,8 +24,8 @@ from rack.boards.events import OF_LAUNCH, Event, Outcome, iterate_statuses
 from rack.boards.faults.bounds import list_affected_mailboxes
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.levels.messages import Error
-from rack.tools.faults.campaigns.pacer import Pacer
 from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
+from rack.tools.faults.campaigns.pacer import Pacer
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, list_strikes, read_arm
 from rack.tools.faults.judge import Circumstances
