@@ -293,6 +293,7 @@ class LockstepDriver(ClockDriver):
             return True
         self.wait_until_settled()
         words[System.HELD] = tick + 1
+        self.alarms.wake_rack()
         while 0 < words[System.HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
             if not self.launcher_is_alive:
                 return False

@@ -41,8 +41,6 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-HELD_S = 0.004
-"""Interval at which a rack that may be held is checked."""
 RERUN_S = 2.0
 """Simulated time of the run after a refused launch, in which each task has some cycles."""
 
@@ -302,7 +300,7 @@ def _watch_run(
     last_tick = -1
     deadline = 0.0
     stopped = False
-    while rack.watch(killer.compute_wait_s() if pacer is None else HELD_S):
+    while rack.watch(killer.compute_wait_s()):
         killer.kill_due_board()
         if pacer is not None:
             pacer.continue_if_held()
