@@ -1,8 +1,8 @@
 """Pace of a trial in lockstep: when its faults begin, and when it may end.
 
 A plan leaves enough time after each fault for the slowest detection and recovery. Most faults are
-settled much sooner. The rack is therefore held from time to time, and judged: once all faults so
-far are settled, the next one begins. Once the verdict on each fault is certain, the trial ends.
+settled much sooner. The rack is therefore held from time to time, and judged: once the newest
+fault is settled, the next one begins. Once the verdict on each fault is certain, the trial ends.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Pacer:
         rack: Rack of the trial, launched with the faults of the plan.
         joints: Names of the joints.
         run: Facts about the run.
-        faults: Faults of the plan.
+        faults: Faults of the plan, in the order of their ticks.
 
     Attributes:
         is_over: Whether the trial was ended early.
@@ -55,6 +55,8 @@ class Pacer:
         self._run = run
         self._words = rack.segment.words
         self._table = FaultTable(rack.segment)
+        used = [entry for entry in self._table.entries if entry.stage != Stage.FREE]
+        self._entries = used[-len(faults) :]
         self._tasks = [rack.segment.get_block(task.name) for task in run.layout.tasks]
         self._faults = faults
         self._hold_before(max(faults[0]["tick"], rack.begins_at))
@@ -64,16 +66,13 @@ class Pacer:
         """Tick at which each fault began or is due."""
         return tuple(entry.tick for entry in self._entries)
 
-    @property
-    def _entries(self) -> list[FaultEntry]:
-        """Entries of the plan's faults in the fault table."""
-        return self._table.entries[: len(self._faults)]
-
     def continue_if_held(self) -> None:
         """If the rack is held, begin the next fault or end the trial if it is time, and go on."""
-        tick = self._words[System.HELD] - 1
-        if tick < 0 or self.is_over:
+        words = self._words
+        # The clock may not have noticed yet that it may continue.
+        if not 0 < words[System.HOLD_AT] <= words[System.HELD]:
             return
+        tick = words[System.HELD] - 1
         # Read all events up to this tick.
         self._rack.watch(0.0)
         struck = list_strikes(self._rack.segment, self._joints)
@@ -88,13 +87,13 @@ class Pacer:
         certain_at = ForesightedJudge(struck, events, self._run).find_certain_tick(tick)
         if certain_at is None:
             # The verdict needs the whole run, so do not hold the rack again.
-            self._words[System.HOLD_AT] = 0
+            words[System.HOLD_AT] = 0
         elif certain_at > tick:
             self._hold_before(certain_at)
         else:
             self.is_over = True
-            self._words[System.STOP_TICK] = max(tick, 1)
-            self._words[System.HOLD_AT] = 0
+            words[System.STOP_TICK] = max(tick, 1)
+            words[System.HOLD_AT] = 0
 
     def _advance_faults(
         self, waiting: Sequence[FaultEntry], judge: ForesightedJudge, tick: int
