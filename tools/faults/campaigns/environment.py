@@ -44,10 +44,11 @@ def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
         A text for each: the path of a segment or semaphore, or id and name of a process.
     """
     processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
-    await_ends(processes, BOUND_S)
+    if processes:
+        await_ends(processes, BOUND_S)
+        processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
-    living = filter(is_alive, sorted(processes))
-    return files + [f"process {pid} ({_read_name(pid)})" for pid in living]
+    return files + [f"process {pid} ({_read_name(pid)})" for pid in sorted(processes)]
 
 
 def _find_board_processes(rack: str) -> set[int]:
