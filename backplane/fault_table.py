@@ -145,6 +145,13 @@ class FaultTable:
             self._words[System.INJECTED] += 1
         return entry
 
+    def advance_waiting(self, ticks: int) -> None:
+        """Move the ticks of all waiting faults forward by `ticks`, while the rack is held."""
+        for entry in self.list_entries((Stage.WAITING,)):
+            entry.tick -= ticks
+        # The clock reads the table again if this number has changed.
+        self._words[System.INJECTED] += 1
+
     def disarm_fault(self, entry: FaultEntry) -> None:
         """Change a waiting fault so that it never begins.
 

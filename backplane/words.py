@@ -86,7 +86,7 @@ class System:
     FAULTS = 43
     DEMAND = 44  # Demand on the arm, written by the clock
     CLOCK_PID = 45
-    INJECTED = 46  # number of faults entered into the fault table
+    INJECTED = 46  # grows when faults are entered into the fault table or moved in it
     LOSSES = 47  # rises by 2 for each board found dead; odd while the crate records a loss
     SYSRESET = 48
     ACFAIL = 49

@@ -40,10 +40,12 @@ The launcher replaces a dead recorder much sooner.
 MAX_BATCH_TICKS = 8
 """Maximum number of ticks in a batch. A request from the host takes effect after the batch."""
 POLL_S = 0.001
-"""Time between two checks while the clock waits for the recorder or the host.
+"""Time between two checks while the clock waits for the recorder or, at first, for the host.
 
 These processes must not be able to disturb the clock, so they have no semaphore to post.
 """
+MAX_POLL_S = 0.016
+"""Longest time between two checks while the host holds the rack."""
 
 
 class LockstepDriver(ClockDriver):
@@ -293,9 +295,12 @@ class LockstepDriver(ClockDriver):
             return True
         self.wait_until_settled()
         words[System.HELD] = tick + 1
+        self.alarms.wake_rack()
+        wait_s = POLL_S
         while 0 < words[System.HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
             if not self.launcher_is_alive:
                 return False
-            time.sleep(POLL_S)
+            time.sleep(wait_s)
+            wait_s = min(2.0 * wait_s, MAX_POLL_S)
         words[System.HELD] = 0
         return True

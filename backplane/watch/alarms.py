@@ -186,7 +186,12 @@ class AlarmWriter:
             text.encode("utf-8", "replace"),
         )
         self._head[0] = count
-        if self._attention is not None and code not in MISSES:
+        if code not in MISSES:
+            self.wake_rack()
+
+    def wake_rack(self) -> None:
+        """Wake the Rack, if this writer has its eventfd."""
+        if self._attention is not None:
             # This never waits: an eventfd can count more alarms than any run raises.
             eventfd_write(self._attention, 1)
 

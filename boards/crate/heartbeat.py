@@ -1,7 +1,8 @@
 """Detection of hanging processes by the Rack: no progress for much longer than their period.
 
 In real time only the clock is checked, because the watchdog in the clock's board checks the tasks.
-In lockstep the clock and all tasks are checked.
+In lockstep the clock and all tasks are checked. There a task may compute for any time on a busy
+machine, so the limit for a task that computes applies to its processor time.
 """
 
 from __future__ import annotations
@@ -9,7 +10,13 @@ from __future__ import annotations
 import time
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.process import ENDED_STATES, STOPPED_STATES, WAITING_STATES, read_state
+from rack.backplane.process import (
+    ENDED_STATES,
+    STOPPED_STATES,
+    WAITING_STATES,
+    read_processor_ns,
+    read_state,
+)
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -22,6 +29,8 @@ LEAST_S = 2.0
 """Shortest time limit. The launcher has no real-time priority and may itself be late."""
 LOCKSTEP_S = 60.0
 """Time limit in lockstep, where simulated time stands still during planning."""
+COMPUTING_S = 1.0
+"""Time without progress after which the processor time of a task is counted."""
 
 
 class Heartbeat:
@@ -38,6 +47,8 @@ class Heartbeat:
         }
         self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
         self._reported: set[str] = set()
+        # Processor time of each task when its count began, in ns.
+        self._used_ns: dict[str, int] = {}
         self._waited_at = -1
 
     def find_hanging(self) -> list[str]:
@@ -56,7 +67,10 @@ class Heartbeat:
             is_idle = done == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
             progress[name] = done, is_idle
         blocks = self._blocks.values()
-        awaits = any(block[Block.AWAITS] for block in blocks)
+        # The clock waits for tasks that have a release. If such a task hangs, it is found itself.
+        awaits = not all(is_idle for _, is_idle in progress.values()) or any(
+            block[Block.AWAITS] for block in blocks
+        )
         # In lockstep a tick of the clock may contain several cycles, which also count as progress.
         ticks = self._words[System.TICK] + sum(block[Block.DONE] for block in blocks)
         progress[CLOCK] = ticks, self._words[System.HELD] or awaits
@@ -66,14 +80,23 @@ class Heartbeat:
             if count != seen or is_excused:
                 self._seen[name] = count, now
                 self._reported.discard(name)
-            elif (
-                now - since > self._bounds[name]
-                and name not in self._reported
-                and (name != CLOCK or self._is_clock_stuck())
-            ):
+                self._used_ns.pop(name, None)
+            elif name not in self._reported and self._is_hanging(name, now - since):
                 hanging.append(name)
         self._reported.update(hanging)
         return hanging
+
+    def _is_hanging(self, name: str, silent_s: float) -> bool:
+        """Return True if a process that has made no progress for `silent_s` is hanging."""
+        if name == CLOCK:
+            return silent_s > self._bounds[name] and self._is_clock_stuck()
+        if silent_s < COMPUTING_S:
+            return False
+        pid = self._blocks[name][Block.PID]
+        used_ns = read_processor_ns(pid)
+        used_ns -= self._used_ns.setdefault(name, used_ns)
+        is_computing = read_state(pid) not in WAITING_STATES + STOPPED_STATES + ENDED_STATES
+        return (used_ns * 1e-9 if is_computing else silent_s) > self._bounds[name]
 
     def _is_clock_stuck(self) -> bool:
         """Return True if the clock's process is stopped or dead, or still waits at the same tick.

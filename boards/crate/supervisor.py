@@ -93,7 +93,10 @@ class Supervisor:
             patience.report_if_due(f"boards {', '.join(absent)} are starting")
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for up to `timeout_s`. Return False if the run has ended."""
+        """Supervise the boards for up to `timeout_s`. Return False if the run has ended.
+
+        If the rack is held, return after the next message or alarm.
+        """
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._wait_for_messages(min(deadline, self._stop_by or deadline) - time.monotonic())
@@ -113,7 +116,7 @@ class Supervisor:
             is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
             if self._is_stopped or self.recovery.is_beyond_help or is_late:
                 self._end_run()
-            if time.monotonic() >= deadline:
+            if time.monotonic() >= deadline or self.segment.words[System.HELD]:
                 break
         return self.outcome is None
 

@@ -135,12 +135,17 @@ class Copier:
         }
         seeds = random.getstate()
         here, theirs = Pipe()
+        own_name = f"{self._segment.rack}:{self._name}"
         with here, theirs:
+            # The copy inherits the name, so that nobody takes it for a board before it has run.
+            name_process(f"{COPY_PREFIX}{self._name}")
             try:
                 pid = os.fork()
             except OSError as error:
+                name_process(own_name)
                 raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
+                name_process(own_name)
                 CopyMessage(tick, self._name, pid).send(self._line, here.fileno(), *memory)
                 # Reap earlier copies that have ended, because they are children of this process.
                 self._copies = [
@@ -150,7 +155,6 @@ class Copier:
                 return None
             here.close()
             copies.detach_segment(self._segment)
-            name_process(f"{COPY_PREFIX}{self._name}")
             request, successor = self._await_request(theirs, offsets, seeds, show)
         die_with_parent(request.crate)
         copies.switch_segment(self._segment, request.rack)

@@ -93,3 +93,14 @@ def test_a_waiting_fault_can_be_withdrawn_and_an_active_one_cannot(
     assert not table.free_entry(begun)
     assert begun.stage == Stage.ACTIVE
     assert table.list_entries((Stage.ACTIVE, Stage.OVER)) == [begun]
+
+
+def test_waiting_faults_can_be_moved_forward_and_the_clock_notices(make_bus: MakeBus) -> None:
+    segment = make_bus(task("level"))
+    table = FaultTable(segment)
+    entries = [table.add_fault(Injection(1, 0, tick=tick)) for tick in (40, 90, 100)]
+    entries[0].stage = Stage.ACTIVE
+    before = segment.words[System.INJECTED]
+    table.advance_waiting(30)
+    assert [entry.tick for entry in entries] == [40, 60, 70]
+    assert segment.words[System.INJECTED] != before

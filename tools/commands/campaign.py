@@ -78,11 +78,12 @@ def campaign(
 
     Each trial has as many faults as fit into a run. Lockstep trials run in parallel on all cores,
     real-time trials one after the other. Up to its first fault a trial equals the faultless run. In
-    lockstep it therefore continues from a snapshot of that run, and ends as soon as the verdict on
-    each of its faults is certain. --json lists the trials for which this was not possible, with
-    reasons. --whole runs each trial from its beginning to the end of its task. The campaign also
-    includes runs without faults in real time, alone and under load. To continue an interrupted
-    campaign, give the same --out.
+    lockstep it therefore continues from a snapshot of that run, each fault begins once the one
+    before is settled, and the trial ends as soon as all verdicts are certain. --json lists the
+    trials for which this was not possible, with reasons. --whole runs each trial from its beginning
+    to the end of its task, with faults at their planned ticks. The campaign also includes runs
+    without faults in real time, alone and under load. To continue an interrupted campaign, give the
+    same --out.
 
     --standby BOARD injects faults into one board, first without a standby and then with one, and
     compares its output. A config that gives the board no standby gets one for the second half.

@@ -228,7 +228,9 @@ class Judge:
     def _find_last_effect(self, strike: Strike, ends: int) -> int:
         """Return the last tick at which a fault that ends at tick `ends` may cause an event."""
         over = max(ends, strike.first_tick + (self._compute_bound(strike) or 0))
-        read = compute_last_read_ticks(strike.mailboxes, self._layout)
+        # Faults of the arm affect no messages, which a slow task might read much later.
+        mailboxes = () if strike.record.where == "arm" else strike.mailboxes
+        read = compute_last_read_ticks(mailboxes, self._layout)
         return over + self._compute_recovery(strike) + read + self._settle
 
     def _list_detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:

@@ -172,3 +172,26 @@ def test_in_lockstep_a_long_plan_does_not_hang(bus: Segment, clock: Clock) -> No
     beat = Heartbeat(bus)
     clock.now_s += 30.0
     assert beat.find_hanging() == []
+
+
+@pytest.mark.parametrize("doing", ["computes", "waits"])
+def test_a_task_that_computes_in_lockstep_hangs_only_after_that_much_processor_time(
+    bus: Segment, clock: Clock, monkeypatch: pytest.MonkeyPatch, doing: str
+) -> None:
+    with (
+        forked(compute if doing == "computes" else signal.pause) as pid,
+        forked(signal.pause) as waiting,
+    ):
+        bus.get_block(SLOW)[Block.PID], bus.words[System.CLOCK_PID] = pid, waiting
+        wait_until(lambda: read_state(waiting) in WAITING_STATES)
+        wait_until(lambda: read_state(pid) in ("R" if doing == "computes" else WAITING_STATES))
+        beat, found = Heartbeat(bus), []
+        bus.get_block(SLOW)[Block.RELEASED] = 1
+        for _ in range(4):
+            clock.now_s += LOCKSTEP_S
+            found += beat.find_hanging()
+        assert found == ([] if doing == "computes" else [SLOW])
+        # Meanwhile the clock waits for the task, and does not hang.
+        if doing == "computes":
+            monkeypatch.setattr(beat, "_bounds", dict.fromkeys((FAST, SLOW, CLOCK), 0.05))
+            wait_until(lambda: beat.find_hanging() == [SLOW])

@@ -29,6 +29,7 @@ from rack.tools.faults.campaigns.draw import (
 )
 from rack.tools.faults.campaigns.environment import check_violation_counter, run_load
 from rack.tools.faults.campaigns.plan import (
+    NOMINAL,
     Plan,
     Targets,
     needs_real_time,
@@ -53,7 +54,6 @@ The number grows from round to round: the fewer faults are missing, the less an 
 ORDER = "order.json"
 TRIALS = "trials"
 """Names of the file with the order, and of the folder of trials, in a campaign's folder."""
-NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ class Campaign:
             return
         if result.shortfalls and plan.number:
             path = self.folder / f"trial-{plan.number:04}.toml"
-            path.write_text(plan.format_faults(self.order.name))
+            path.write_text(result.actual_plan.format_faults(self.order.name))
         text = f"{_describe_plan(plan)}: {result.ended}"
         self._progress.end_run(self._estimate_s([plan]), text, result.shortfalls)
 

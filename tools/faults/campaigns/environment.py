@@ -43,8 +43,10 @@ def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
     Returns:
         A text for each: the path of a segment or semaphore, or id and name of a process.
     """
-    await_ends({*_find_board_processes(rack), *(list_living_descendants() - pids_before)}, BOUND_S)
     processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
+    if processes:
+        await_ends(processes, BOUND_S)
+        processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
     return files + [f"process {pid} ({_read_name(pid)})" for pid in sorted(processes)]
 

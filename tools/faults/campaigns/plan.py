@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -83,6 +83,11 @@ class Plan:
             }
         )
 
+    def move_faults(self, ticks: Sequence[int]) -> Plan:
+        """Return a copy of the plan whose faults begin at the given ticks."""
+        moved = ({**table, "tick": tick} for table, tick in zip(self.faults, ticks, strict=True))
+        return replace(self, faults=tuple(moved))
+
     def format_faults(self, config: str) -> str:
         """Return the content of a file for `--faults` that repeats this plan.
 
@@ -96,6 +101,9 @@ class Plan:
         ]
         head = f"# Trial {self.number}: rack run {config}{mode} --faults THIS_FILE"
         return "\n".join([head, *kills, "", faults])
+
+
+NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
 def strike_active_copies(plans: Iterable[Plan], layout: Layout, board: str) -> list[Plan]:

@@ -47,6 +47,8 @@ class TrialResult:
         whole: Why the trial did not continue from a snapshot. Empty if it did.
         outages: Ticks without output after each fault that ended the process of an executor.
         missing: Number of messages that the boards of its faults have not written.
+        begins: Tick at which each fault of the plan began, or was due when the trial ended. Empty
+            if the trial kept to the ticks of its plan.
     """
 
     plan: Plan
@@ -67,6 +69,12 @@ class TrialResult:
     whole: str = ""
     outages: tuple[int, ...] = ()
     missing: int = 0
+    begins: tuple[int, ...] = ()
+
+    @property
+    def actual_plan(self) -> Plan:
+        """The plan with the ticks at which its faults began."""
+        return self.plan.move_faults(self.begins) if self.begins else self.plan
 
 
 def judge_trial(trial: Trial) -> TrialResult:
@@ -96,6 +104,7 @@ def judge_trial(trial: Trial) -> TrialResult:
         if trial.run is not None
         else (),
         missing=trial.missing,
+        begins=trial.begins,
     )
 
 

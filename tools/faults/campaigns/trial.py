@@ -20,13 +20,13 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event, Outcome, iterate_statuses
+from rack.boards.events import OF_LAUNCH, Event, Outcome, iterate_statuses
 from rack.boards.faults.bounds import list_affected_mailboxes
+from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.levels.messages import Error
-from rack.tools.faults.campaigns.base import BaseRack, Start
-from rack.tools.faults.campaigns.certainty import EarlyEnd
 from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
 from rack.tools.faults.campaigns.outages import count_missing_messages
+from rack.tools.faults.campaigns.pacer import Pacer
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, list_strikes, read_arm
 from rack.tools.faults.judge import Circumstances
@@ -42,8 +42,6 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-HELD_S = 0.004
-"""Interval at which a rack that may be held is checked."""
 RERUN_S = 2.0
 """Simulated time of the run after a refused launch, in which each task has some cycles."""
 
@@ -123,6 +121,26 @@ def build_external_kill(layout: Layout, board: str, tick: int, time_ns: int) -> 
     )
 
 
+@dataclass(frozen=True)
+class Start:
+    """Starting point of a trial.
+
+    Attributes:
+        tick: Tick before which the trial starts.
+        whole: Why the trial does not continue from a snapshot. Empty if it does, and for the
+            faultless run.
+        continues: The snapshot from which to continue. None for a whole run.
+        snapshots: When the trial takes snapshots. None for no snapshots.
+        events: Events of the faultless run that the trial continues.
+    """
+
+    tick: int = 0
+    whole: str = ""
+    continues: Continuation | None = None
+    snapshots: SnapshotPolicy | None = None
+    events: tuple[Event, ...] = ()
+
+
 @dataclass
 class Trial:
     """A trial that was run.
@@ -140,6 +158,7 @@ class Trial:
         levels: Last state of each level, as text.
         is_late: Whether a level ended with an error because it could not meet a time.
         again: Outcome of a second run, without the faults, after a refused launch.
+        begins: Tick at which each fault of the plan began, or was due when the run ended.
         start: Starting point of the trial.
         missing: Number of messages that the boards of its faults have not written.
         is_cut: Whether the trial was ended early because the verdict on each fault was certain.
@@ -157,6 +176,7 @@ class Trial:
     levels: str = ""
     is_late: bool = False
     again: Outcome | None = None
+    begins: tuple[int, ...] = ()
     start: Start = field(default_factory=Start)
     missing: int = 0
     is_cut: bool = False
@@ -169,13 +189,13 @@ def run_trial(
     ticks: int,
     seconds: float | None,
     *,
-    base: BaseRack | None = None,
+    start: Start = Start(),
     crate: WarmCrate | None = None,
 ) -> Trial:
     """Run a plan and return the data for its evaluation.
 
-    If possible, the trial continues from a snapshot of the faultless rack. It then ends as soon as
-    the verdict on each of its faults is certain.
+    In a trial that continues from a snapshot, each fault begins as soon as the ones before it are
+    settled, but not after its planned tick. The trial ends as soon as all verdicts are certain.
 
     Args:
         config: Config of the rack, without faults.
@@ -183,32 +203,43 @@ def run_trial(
         rack_name: Name of the rack.
         ticks: Length of a faultless run in ticks. 0 if unknown.
         seconds: Simulated time in s after which the run ends if no task ends it.
-        base: Faultless rack. None to run the whole trial.
+        start: Starting point of the trial.
         crate: Crate that runs the rack and has the snapshots. None to start a new one.
 
     Raises:
         ConfigError: The plan does not fit the config.
     """
-    start = Start(whole="as asked") if base is None else base.find_start(plan, crate, seconds)
     trial = Trial(plan)
     pids_before = list_living_descendants()
     started = time.monotonic()
-    rack = Rack(plan.to_config(config, rack_name), crate=crate, continues=start.continues)
+    rack = Rack(
+        plan.to_config(config, rack_name),
+        crate=crate,
+        snapshots=start.snapshots,
+        continues=start.continues,
+    )
     try:
         with rack:
-            start = start.resolve_snapshot(rack.begins_at)
-            rack.events.extend(start.events)
+            begin = max(0, rack.begins_at)
+            start = replace(start, tick=begin)
+            rack.events.extend(
+                event
+                for event in start.events
+                if event.tick < begin and event.kind not in (*OF_LAUNCH, "end")
+            )
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
-            certainty = None
-            if start.continues is not None and not plan.kills:
-                certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan))
-            _watch_run(rack, killer, ticks, seconds, certainty)
-            trial.is_cut = certainty is not None and certainty.is_reached
+            pacer = None
+            if start.continues is not None and plan.faults and not plan.kills:
+                pacer = Pacer(rack, joints, _collect_circumstances(rack, plan), plan.faults)
+            _watch_run(rack, killer, ticks, seconds, pacer)
+            trial.is_cut = pacer is not None and pacer.is_over
             trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)
             find_board = rack.segment.layout.find_first_copy
             boards = {find_board(strike.board) for strike in trial.strikes}
             trial.missing = count_missing_messages(rack.segment, boards)
+            if pacer is not None:
+                trial.begins = pacer.begins
             trial.arm = read_arm(rack.segment)
             trial.levels = format_levels(rack.segment)
             trial.is_late = is_late(rack.segment)
@@ -260,11 +291,11 @@ def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
 
 
 def _watch_run(
-    rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: EarlyEnd | None
+    rack: Rack, killer: Killer, ticks: int, seconds: float | None, pacer: Pacer | None
 ) -> None:
     """Start the run and watch it to its end. Kill boards as planned.
 
-    The run is stopped if it takes too long, or ended early if `certainty` permits it.
+    The run is stopped if it takes too long, or ended early if `pacer` does so.
     """
     rack.start(seconds)
     words = rack.segment.words
@@ -275,10 +306,10 @@ def _watch_run(
     last_tick = -1
     deadline = 0.0
     stopped = False
-    while rack.watch(killer.compute_wait_s() if certainty is None else HELD_S):
+    while rack.watch(killer.compute_wait_s()):
         killer.kill_due_board()
-        if certainty is not None:
-            certainty.evaluate_if_held()
+        if pacer is not None:
+            pacer.continue_if_held()
         now_s = time.monotonic()
         if stopped and now_s > deadline:
             return

@@ -20,9 +20,9 @@ from rack.boards.crate.line import WarmCrate
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.base import BaseRack
-from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.faults.campaigns.plan import NOMINAL, Plan
 from rack.tools.faults.campaigns.results import save_result
-from rack.tools.faults.campaigns.trial import run_trial
+from rack.tools.faults.campaigns.trial import Start, run_trial
 
 LOOK_S = 0.2
 """Maximum time until a waiting campaign notices an interrupt."""
@@ -133,10 +133,15 @@ class TrialRunner:
         is_lockstep = job.plan.lockstep
         os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
         crate = self._prepare_crate(is_lockstep)
-        base = None if self._whole else self._base
-        name = self._base.name
+        base = self._base
+        start = Start(whole="as asked")
+        if not self._whole:
+            if crate is not None and job.plan == NOMINAL:
+                save_result(base.run(crate, job.seconds), job.path)
+                return
+            start = base.find_start(job.plan, crate)
         trial = run_trial(
-            self._config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
+            self._config, job.plan, base.name, job.ticks, job.seconds, start=start, crate=crate
         )
         save_result(trial, job.path)
 

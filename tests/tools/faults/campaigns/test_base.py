@@ -15,11 +15,11 @@ from rack.boards.config import RackConfig, load, resolve_layout
 from rack.boards.crate.line import WarmCrate
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.campaigns import base as base_rack
-from rack.tools.faults.campaigns.base import BaseRack, Start
+from rack.tools.faults.campaigns.base import BaseRack
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans
-from rack.tools.faults.campaigns.plan import Kill, Plan, Targets, needs_real_time
+from rack.tools.faults.campaigns.plan import NOMINAL, Kill, Plan, Targets, needs_real_time
 from rack.tools.faults.campaigns.results import judge_trial
-from rack.tools.faults.campaigns.trial import Trial, run_trial
+from rack.tools.faults.campaigns.trial import Start, Trial, run_trial
 from tests.conftest import EXHAUSTIVE
 
 SECONDS = 5.0
@@ -28,7 +28,17 @@ MOVES = 1130
 SAMPLE = 12
 """Kinds of faults that are tried, of about 40."""
 MUTE = {"kind": "mute", "board": "lower", "tick": STRIKES, "for": "50ms"}
-OF_ONE_RUN = ("wall_s", "notes", "start", "whole", "ended", "ticks", "digest", "touches")
+OF_ONE_RUN = (
+    "wall_s",
+    "notes",
+    "start",
+    "whole",
+    "begins",
+    "ended",
+    "ticks",
+    "digest",
+    "touches",
+)
 """Fields of a result that are not of the verdict, or of its end."""
 
 
@@ -46,9 +56,12 @@ class Bench:
         self.base = BaseRack(self._config, name)
         self.crate = crate
 
-    def run(self, plan: Plan, whole: bool = False) -> Trial:
-        base, name = None if whole else self.base, self.base.name
-        return run_trial(self._config, plan, name, 0, SECONDS, base=base, crate=self.crate)
+    def run(self, plan: Plan, whole: bool = False, seconds: float = SECONDS) -> Trial:
+        """Run a plan."""
+        start = Start() if whole else self.base.find_start(plan, self.crate)
+        return run_trial(
+            self._config, plan, self.base.name, 0, seconds, start=start, crate=self.crate
+        )
 
 
 def verdict(trial: Trial) -> dict[str, Any]:
@@ -133,6 +146,53 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
 
 
 @pytest.mark.slow
+def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
+    later = ((520, "upper.command"), (700, "lower.status"), (1000, "upper.command"))
+    faults = tuple(
+        {**MUTE, "board": box.partition(".")[0], "mailbox": box, "tick": tick}
+        for tick, box in ((STRIKES, "lower.status"), *later)
+    )
+    plan = Plan(1, "faults", True, (*faults, {"kind": "kill", "board": "upper", "tick": 1200}))
+    trial = bench.run(plan)
+    begins = trial.begins
+    assert trial.is_cut
+    # The third and fourth affect the mailboxes of the first two, so the times that are planned for
+    # those have passed in between.
+    assert (begins[0], begins[2]) == (STRIKES, STRIKES + 190)
+    assert STRIKES + 20 < begins[1] < 520
+    assert begins[1] + 180 <= begins[3] < begins[2] + 300
+    assert begins[3] + 20 < begins[4] < begins[3] + 200
+    assert [strike.began for strike in trial.strikes] == [*begins]
+    assert all(fault.seen == "detected" for fault in judge_trial(trial).faults)
+    # Equal plans have equal trials.
+    again = bench.run(plan)
+    assert (again.begins, again.outcome) == (begins, trial.outcome)
+    # A run with faults at these ticks is the same, and has the same verdicts.
+    actual = judge_trial(trial).actual_plan
+    assert [table["tick"] for table in actual.faults] == [*begins]
+    whole = bench.run(actual, whole=True)
+    assert {**verdict(trial), "plan": None} == {**verdict(whole), "plan": None}
+    assert (whole.begins, judge_trial(whole).actual_plan) == ((), actual)
+
+
+@pytest.mark.slow
+def test_the_faultless_rack_runs_only_as_far_as_necessary_and_equals_one_without_snapshots(
+    bench: Bench,
+) -> None:
+    part = bench.base.run(bench.crate, 0.6)
+    assert bench.base.run(bench.crate, 0.5) is part
+    assert part.outcome is not None
+    assert part.outcome.ticks == 240
+    rest = bench.base.run(bench.crate, SECONDS)
+    assert (rest.start.tick, bench.base.run(bench.crate, 1.0)) == (200, rest)
+    whole = bench.run(NOMINAL, whole=True)
+    assert rest.outcome is not None
+    assert whole.outcome is not None
+    assert (rest.outcome.digest, rest.left) == (whole.outcome.digest, ())
+    assert [event.kind for event in rest.events].count("end") == 1
+
+
+@pytest.mark.slow
 def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
     plan = Plan(1, "kills", True, (), (Kill("lower", 600, 0.5),))
     found = bench.run(plan)
@@ -144,8 +204,8 @@ def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
 def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> None:
     soon = Plan(1, "faults", False, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
-    assert bench.base.find_start(soon, None, SECONDS) == Start(whole="real time")
-    assert bench.base.find_start(early, bench.crate, SECONDS).whole == "a fault prevents the launch"
+    assert bench.base.find_start(soon, None) == Start(whole="real time")
+    assert bench.base.find_start(early, bench.crate).whole == "a fault prevents the launch"
 
 
 @pytest.mark.slow
