@@ -195,9 +195,8 @@ class Fork(subprocess.Popen[Any]):
             _take_over(order, fds)
             # What the command does at its own exit is not for this process to do.
             atexit._clear()
-            _open_streams()
             # As by `python -u`: boards flush nothing at their end.
-            sys.stdout.reconfigure(write_through=True)  # type: ignore[union-attr]
+            _open_streams(is_unbuffered=True)
             run_and_exit(order)
         self._child_created = True
         self._close_pipe_fds(*given[10:16])  # type: ignore[attr-defined]
@@ -226,7 +225,8 @@ def run_command(
     words: Sequence[str | Path], bound_s: float, **given: Any
 ) -> subprocess.CompletedProcess[Any]:
     """Run a command to its end, as `subprocess.run` does."""
-    with Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **given) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with Popen(words, **(pipes | given)) as process:
         try:
             out, err = process.communicate(timeout=bound_s)
         finally:
@@ -285,15 +285,16 @@ def _take_over(order: Order, fds: Sequence[int]) -> None:
     path = dict.fromkeys(filter(None, [*given, *sys.path]))
     sys.path[:] = path if order.is_safe else [order.folder, *path]
     if order.module == COMMAND:
-        _open_streams()
+        _open_streams(bool(order.environment.get("PYTHONUNBUFFERED")))
         for starter in STARTERS:
             starter.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": Fork})
 
 
-def _open_streams() -> None:
+def _open_streams(is_unbuffered: bool) -> None:
     """Open the standard streams on the descriptors that there are now."""
     sys.stdin = os.fdopen(0, closefd=False)
     sys.stdout = os.fdopen(1, "w", closefd=False)
+    sys.stdout.reconfigure(write_through=is_unbuffered)
     sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
 
 
