@@ -7,7 +7,7 @@ fork of it that runs the program from the top of its `__main__` on: a child of t
 with the arguments, environment, folder and descriptors that `subprocess` would give it.
 
 What such a fork would not inherit starts as ever: in a process that a test has forked, or whose
-user, limits, processors or namespaces are not those that the tests began with.
+user, limits, processors, namespaces or ignored signals are not those that the tests began with.
 
 Commands that tests start by `Popen` or `run_command` come from a stock as well, and fork crate and
 recorder from themselves. Tests of how commands start (imports, streams, interpreter options) start
@@ -39,6 +39,7 @@ from typing import Any, NamedTuple, NoReturn
 from rack.backplane.process import list_children
 from rack.boards.crate import line
 from rack.boards.crate.line import build_environment
+from rack.tools.console.interrupt import SIGNALS
 from rack.tools.recording.recorder import process as recorder_process
 
 CRATE = "rack.boards.crate"
@@ -81,6 +82,7 @@ class Order(NamedTuple):
     folder: str
     numbers: Sequence[int]
     is_safe: bool  # as by `python -P`: the folder is not on the path of modules
+    has_session: bool
 
 
 def standing() -> tuple[object, ...]:
@@ -171,7 +173,8 @@ class Popen(subprocess.Popen[Any]):
 
     def _execute_child(self, *given: Any) -> None:
         order, fds = read_order(given)
-        if standing() != USUAL or max(order.numbers) >= FIRST_FREE:
+        is_deaf = signal.SIG_IGN in map(signal.getsignal, SIGNALS)
+        if standing() != USUAL or is_deaf or max(order.numbers) >= FIRST_FREE:
             super()._execute_child(*given)  # type: ignore[misc]
             return
         if order.module not in STOCKS:
@@ -217,6 +220,7 @@ def read_order(given: Sequence[Any]) -> tuple[Order, list[int]]:
         str(folder or Path.cwd()),
         [0, 1, 2, *pass_fds],
         "-P" in words[:begin],
+        has_session=given[21],
     )
     return order, [*fds, *pass_fds]
 
@@ -271,6 +275,8 @@ def served(line: socket.socket) -> Order | None:
 
 def _take_over(order: Order, fds: Sequence[int]) -> None:
     """Be as the order's program is when it begins."""
+    if order.has_session:
+        os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     waiting = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, FIRST_FREE) for fd in fds]
     os.closerange(3, FIRST_FREE)
@@ -348,7 +354,6 @@ def main() -> None:
     if module == COMMAND:
         # `python -m` has put this folder there.
         sys.path.remove(str(ROOT))
-        importlib.import_module("rack.boards.run.compiled_mailbox").load_machine_code()
     gc.freeze()
     if order := served(socket.socket(fileno=int(number))):
         if order.module == COMMAND:
