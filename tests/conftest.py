@@ -15,9 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.crate import line
 from rack.tools.commands.new import TEMPLATES
-from rack.tools.recording.recorder import process as recorder_process
 from tests import warm
 from tests.machine import stolen, turn
 
@@ -126,7 +124,7 @@ def _in_stock() -> Iterator[None]:
     """Start the crates and recorders of racks in this process from stock."""
     warm.fill()
     with pytest.MonkeyPatch.context() as patch:
-        for starter in (line, recorder_process):
+        for starter in warm.STARTERS:
             patch.setattr(starter, "subprocess", warm.subprocess_in_stock)
         yield
     warm.clear()

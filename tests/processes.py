@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from tests import warm
+
 RACK = (sys.executable, "-m", "rack.tools.cli")
 """The `rack` command of the environment that runs the tests."""
 BOUND_S = 50.0
@@ -84,7 +86,7 @@ def start_rack(command: Sequence[str | Path], name: str, log: Path) -> subproces
     board.
     """
     with log.open("w") as said:
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+        process = warm.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
 
     def has_begun() -> bool:
         whole, _, _ = log.read_text().rpartition("\n")

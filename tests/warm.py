@@ -7,12 +7,16 @@ fork of it that runs the program from the top of its `__main__` on: a child of t
 with the arguments, environment, folder and descriptors that `subprocess` would give it.
 
 What such a fork would not inherit starts as ever: in a process that a test has forked, or whose
-user, limits, processors or namespaces are not those that the tests began with. Racks that tests
-launch by a command start as ever, too.
+user, limits, processors, namespaces or ignored signals are not those that the tests began with.
+
+Commands that tests start by `Popen` or `run_command` come from a stock as well, and fork crate and
+recorder from themselves. Tests of how commands start (imports, streams, interpreter options) start
+them by `subprocess`.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import fcntl
 import gc
@@ -25,19 +29,27 @@ import signal
 import socket
 import subprocess
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
+from rack.backplane.process import list_children
+from rack.boards.crate import line
 from rack.boards.crate.line import build_environment
-from tests.processes import children_of
+from rack.tools.console.interrupt import SIGNALS
+from rack.tools.recording.recorder import process as recorder_process
 
 CRATE = "rack.boards.crate"
+RECORDER = "rack.tools.recording.recorder"
+COMMAND = "rack.tools.cli"
+STARTERS = (line, recorder_process)
+"""Modules that start a rack's programs by `subprocess`."""
 LIBRARIES = {
     CRATE: ("rack.boards.crate.crate",),
-    "rack.tools.recording.recorder": (
+    RECORDER: (
         "numpy.strings",
         "rack.boards.config.commands",
         "rack.levels.systems.joint_boards.messages",
@@ -46,6 +58,14 @@ LIBRARIES = {
     ),
 }
 """What each program imports."""
+LIBRARIES[COMMAND] = (
+    *LIBRARIES[CRATE],
+    *LIBRARIES[RECORDER],
+    "rack.tools.commands.check",
+    "rack.tools.commands.run",
+    "rack.tools.report.report_markdown",
+    "typer",
+)
 PR_SET_CHILD_SUBREAPER = 36
 FIRST_FREE = 1 << 10
 """Descriptors wait up here for their own numbers, so that none takes another's."""
@@ -61,6 +81,8 @@ class Order(NamedTuple):
     environment: dict[str, str]
     folder: str
     numbers: Sequence[int]
+    is_safe: bool  # as by `python -P`: the folder is not on the path of modules
+    has_session: bool
 
 
 def standing() -> tuple[object, ...]:
@@ -79,18 +101,25 @@ def standing() -> tuple[object, ...]:
 
 
 USUAL = standing()
+ENVIRONMENT = build_environment()
+ROOT = Path(__file__).parents[1]
 
 
 class Stock:
     """The near end of a process that has a program's libraries."""
 
     def __init__(self, module: str) -> None:
+        environment = dict(ENVIRONMENT)
+        if module == COMMAND:
+            # It is to find modules as a command of the user does.
+            del environment["PYTHONPATH"]
         self._line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._process = subprocess.Popen(
             [sys.executable, "-u", "-m", "tests.warm", str(theirs.fileno()), module],
             pass_fds=(theirs.fileno(),),
             stdin=subprocess.DEVNULL,
-            env=build_environment(),
+            cwd=ROOT,
+            env=environment,
         )
         theirs.close()
         self.pid = self._process.pid
@@ -119,8 +148,8 @@ STOCKS: dict[str, Stock] = {}
 
 
 def fill() -> None:
-    """Start the stocks."""
-    STOCKS.update({module: Stock(module) for module in LIBRARIES})
+    """Start the stocks of crates and recorders. The first command starts that of commands."""
+    STOCKS.update({module: Stock(module) for module in (CRATE, RECORDER)})
 
 
 def clear() -> None:
@@ -134,27 +163,79 @@ def programs(module: str) -> list[int]:
     stocks = {stock.pid for stock in STOCKS.values()}
     return [
         pid
-        for pid in children_of(os.getpid())
+        for pid in list_children(os.getpid())
         if pid not in stocks and module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
 
 
-class Popen(subprocess.Popen[bytes]):
+class Popen(subprocess.Popen[Any]):
     """`subprocess.Popen` for `python -m MODULE ...` with a MODULE that is in stock."""
 
     def _execute_child(self, *given: Any) -> None:
-        args, _, _, _, pass_fds, _, env, *_ = given
-        # Of stdin, stdout and stderr, the program's end and this process's, -1 where it has none.
-        pipes = given[10:16]
-        numbers = [0, 1, 2, *pass_fds]
-        if standing() != USUAL or max(numbers) >= FIRST_FREE:
+        order, fds = read_order(given)
+        is_deaf = signal.SIG_IGN in map(signal.getsignal, SIGNALS)
+        if standing() != USUAL or is_deaf or max(order.numbers) >= FIRST_FREE:
             super()._execute_child(*given)  # type: ignore[misc]
             return
-        module, *arguments = args[args.index("-m") + 1 :]
-        order = Order(module, arguments, dict(env), str(Path.cwd()), numbers)
-        self.pid = STOCKS[module].start(order, [pipes[0], pipes[3], pipes[5], *pass_fds])
+        if order.module not in STOCKS:
+            STOCKS[order.module] = Stock(order.module)
+        self.pid = STOCKS[order.module].start(order, fds)
         self._child_created = True
-        self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
+        self._close_pipe_fds(*given[10:16])  # type: ignore[attr-defined]
+
+
+class Fork(subprocess.Popen[Any]):
+    """`subprocess.Popen` for `python -m MODULE ...` in a command, whose fork has the libraries."""
+
+    def _execute_child(self, *given: Any) -> None:
+        order, fds = read_order(given)
+        self.pid = os.fork()
+        if self.pid == 0:
+            for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
+                # As by `exec`: what is handled is no longer, what is ignored still is.
+                if signal.getsignal(number) not in (signal.SIG_IGN, signal.SIG_DFL, None):
+                    signal.signal(number, signal.SIG_DFL)
+            _take_over(order, fds)
+            # What the command does at its own exit is not for this process to do.
+            atexit._clear()
+            # As by `python -u`: boards flush nothing at their end.
+            _open_streams(is_unbuffered=True)
+            run_and_exit(order)
+        self._child_created = True
+        self._close_pipe_fds(*given[10:16])  # type: ignore[attr-defined]
+
+
+def read_order(given: Sequence[Any]) -> tuple[Order, list[int]]:
+    """Return the order in the arguments of `_execute_child`, and its descriptors."""
+    args, _, _, _, pass_fds, folder, environment, *_ = given
+    words = [os.fspath(arg) for arg in args]
+    begin = words.index("-m") + 1
+    # The program's ends of stdin, stdout and stderr; -1 to inherit them.
+    standard = (given[10], given[13], given[15])
+    fds = [number if fd == -1 else fd for number, fd in enumerate(standard)]
+    order = Order(
+        words[begin],
+        words[begin + 1 :],
+        dict(os.environ if environment is None else environment),
+        str(folder or Path.cwd()),
+        [0, 1, 2, *pass_fds],
+        "-P" in words[:begin],
+        has_session=given[21],
+    )
+    return order, [*fds, *pass_fds]
+
+
+def run_command(
+    words: Sequence[str | Path], bound_s: float, **given: Any
+) -> subprocess.CompletedProcess[Any]:
+    """Run a command to its end, as `subprocess.run` does."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with Popen(words, **(pipes | given)) as process:
+        try:
+            out, err = process.communicate(timeout=bound_s)
+        finally:
+            process.kill()
+    return subprocess.CompletedProcess(words, process.returncode, out, err)
 
 
 subprocess_in_stock = SimpleNamespace(**{**vars(subprocess), "Popen": Popen})
@@ -194,6 +275,8 @@ def served(line: socket.socket) -> Order | None:
 
 def _take_over(order: Order, fds: Sequence[int]) -> None:
     """Be as the order's program is when it begins."""
+    if order.has_session:
+        os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     waiting = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, FIRST_FREE) for fd in fds]
     os.closerange(3, FIRST_FREE)
@@ -204,8 +287,40 @@ def _take_over(order: Order, fds: Sequence[int]) -> None:
     os.environ.clear()
     os.environ.update(order.environment)
     sys.argv[1:] = order.arguments
-    given = order.environment["PYTHONPATH"].split(os.pathsep)
-    sys.path[:] = [order.folder, *dict.fromkeys([*given, *sys.path])]
+    given = order.environment.get("PYTHONPATH", "").split(os.pathsep)
+    path = dict.fromkeys(filter(None, [*given, *sys.path]))
+    sys.path[:] = path if order.is_safe else [order.folder, *path]
+    if order.module == COMMAND:
+        _open_streams(bool(order.environment.get("PYTHONUNBUFFERED")))
+        for starter in STARTERS:
+            starter.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": Fork})
+
+
+def _open_streams(is_unbuffered: bool) -> None:
+    """Open the standard streams on the descriptors that there are now."""
+    sys.stdin = os.fdopen(0, closefd=False)
+    sys.stdout = os.fdopen(1, "w", closefd=False)
+    sys.stdout.reconfigure(write_through=is_unbuffered)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+
+
+def run_and_exit(order: Order) -> NoReturn:
+    """Run a program to its end, and end without freeing its libraries, which takes 0.1 s."""
+    status: object = 1
+    try:
+        runpy.run_module(order.module, run_name="__main__", alter_sys=True)
+        status = 0
+    except SystemExit as end:
+        status = end.code or 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        if not isinstance(status, int):
+            print(status, file=sys.stderr)  # noqa: T201  # as Python does
+            status = 1
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        os._exit(status)
 
 
 def load_levels() -> None:
@@ -234,10 +349,15 @@ def main() -> None:
     number, module = sys.argv[1:]
     for library in LIBRARIES[module]:
         importlib.import_module(library)
-    if module == CRATE:
+    if module != RECORDER:
         load_levels()
+    if module == COMMAND:
+        # `python -m` has put this folder there.
+        sys.path.remove(str(ROOT))
     gc.freeze()
     if order := served(socket.socket(fileno=int(number))):
+        if order.module == COMMAND:
+            run_and_exit(order)
         runpy.run_module(order.module, run_name="__main__", alter_sys=True)
 
 

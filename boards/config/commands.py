@@ -23,7 +23,6 @@ from rack.boards.config.schedulers import list_reservation_mistakes, list_valid_
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import compute_first_tick
 from rack.boards.errors import ConfigError, Mistake, Mistakes
-from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.operator import (
     NAMED_OPERATIONS,
@@ -99,6 +98,9 @@ def _encode_request(command: CommandConfig, layout: Layout) -> Request:
         message.position[:] = command.position
         message.direction[:] = command.direction or DOWN
     if command.quaternion is not None:
+        # Import MuJoCo only for goals with an orientation.
+        from rack.levels.algebra import norm
+
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     message.name = command.name or ""
     return Request(

@@ -92,6 +92,7 @@ class ClockCopies:
         self._copier = copier
         self._not_before_s = 0.0
         self._taken_at = -sys.maxsize
+        self._is_refused = False
 
     def __call__(self, tick: int) -> int:
         """Take a snapshot before `tick`, if one is due and no task is lost or stopped.
@@ -100,6 +101,8 @@ class ClockCopies:
             The next tick before which a snapshot is due. Snapshots that are due at a time, not at a
                 tick, are disregarded.
         """
+        if self._is_refused:
+            return sys.maxsize
         words = self._segment.words
         requested_tick = words[System.SNAPSHOT_AT] - 1
         part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
@@ -135,7 +138,7 @@ class ClockCopies:
             # A task that cannot be copied now could not be copied later either. Stop trying.
             for task in tasks:
                 task.block[Block.COPY] = 0
-            self._not_before_s = float("inf")
+            self._is_refused = True
             return False
         self._taken_at = tick
         memory = copy_memory(self._segment)

@@ -12,6 +12,7 @@ from rack.backplane.words import System
 from tests.boards.table_racks import counting
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.warm import Popen
 
 
 @contextmanager
@@ -22,7 +23,7 @@ def held_rack(
     path = folder / "counting.toml"
     path.write_text(counting(folder))
     words = ("--lockstep", "--step", "--set", f"name={name}", *(options or ("--no-record",)))
-    with subprocess.Popen([*RACK, "run", path, *words], cwd=ROOT) as process:
+    with Popen([*RACK, "run", path, *words], cwd=ROOT) as process:
         wait_until(lambda: name in list_racks(), BOUND_S)
         segment = Segment.attach(name)
         try:

@@ -18,6 +18,7 @@ from rack.tools.cli import COMMANDS
 from tests.processes import RACK
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.warm import run_command
 
 LONG = "a" * 5000
 NAMES = [name for found in COMMANDS.values() for name in found]
@@ -95,14 +96,8 @@ def printed_to(
     stdout: int, arguments: tuple[str, ...], unbuffered: str
 ) -> subprocess.CompletedProcess[str]:
     """Run a command that prints to a descriptor."""
-    return subprocess.run(
-        [*RACK, *arguments],
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-        timeout=BOUND_S,
-    )
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    return run_command([*RACK, *arguments], BOUND_S, stdout=stdout, env=environment, text=True)
 
 
 @pytest.mark.slow

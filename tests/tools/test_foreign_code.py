@@ -20,6 +20,7 @@ from rack.tools.cli import COMMANDS
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, start_rack, wait_until
 from tests.tools.command_line import BOUND_S, rack
+from tests.warm import Popen
 
 MODULE = "spy_levels"
 SPY = '''
@@ -259,7 +260,7 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
         "FOXGLOVE_PORT": "0",
     }
     started = {
-        command: subprocess.Popen(
+        command: Popen(
             [*RACK, command, *map(str, arguments(guarded))],
             env=environment,
             stdout=subprocess.PIPE,

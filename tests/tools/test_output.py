@@ -20,6 +20,7 @@ from tests.processes import RACK
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 from tests.tools.held_racks import held_rack
+from tests.warm import Popen
 
 NAMES = [name for commands in COMMANDS.values() for name in commands]
 IDLE = (
@@ -116,9 +117,7 @@ def test_a_pipe_gets_no_wide_line_about_a_running_rack(tmp_path: Path, rack_name
 def print_into_closed_pipe(arguments: list[str]) -> subprocess.CompletedProcess[str]:
     """Run a command whose reader closes the pipe after its first line, as `head -1` does."""
     reader, writer = os.pipe()
-    with subprocess.Popen(
-        [*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with Popen([*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True) as process:
         os.close(writer)
         try:
             os.read(reader, 1)
@@ -159,7 +158,7 @@ def show_on_terminal(arguments: list[str], columns: int) -> str:
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     hidden = ("COLUMNS", "LINES")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
-    with subprocess.Popen(
+    with Popen(
         [*RACK, *arguments],
         cwd=ROOT,
         stdout=terminal,

@@ -16,6 +16,7 @@ from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.processes import RACK, children_of, wait_until
 from tests.tools.command_line import BOUND_S, rack
+from tests.warm import Popen
 
 FOLDER = Path(__file__).parent
 LOOPBACK = """
@@ -125,9 +126,7 @@ def held_rack(
     command = [*RACK, "run", *map(str, words), "--lockstep", "--step", "--set", f"name={name}"]
     with (
         log.open("w") as output,
-        subprocess.Popen(
-            command, stdout=output, stderr=output, env={**os.environ, **environment}
-        ) as process,
+        Popen(command, stdout=output, stderr=output, env={**os.environ, **environment}) as process,
     ):
         try:
             wait_until(lambda: name in list_racks() or process.poll() is not None, BOUND_S)

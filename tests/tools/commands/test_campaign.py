@@ -14,6 +14,7 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from tests.processes import RACK, children_of, named, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.warm import Popen
 
 pytestmark = pytest.mark.thorough
 
@@ -51,7 +52,7 @@ def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
     options = (*LOCKSTEP, "--kinds", "kill,hang,self-test", "--out", str(out))
     trials = out / "trials"
     command = [*RACK, "campaign", str(small), *options]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+    with Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: len(list(trials.glob("0*.json"))) > 0, BOUND_S)
         finally:

@@ -20,13 +20,14 @@ from rack.tools.console.interrupt import list_descendants
 from tests.processes import RACK, runs, wait_until
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.warm import Popen, run_command
 
 
 @contextmanager
 def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A real-time rack without an end, after its first cycles."""
     command = [*RACK, "run", str(small), "--set", "clock.mode=realtime"]
-    process = subprocess.Popen(
+    process = Popen(
         [*command, "--set", f"name={name}", *arguments],
         cwd=ROOT,
         stdout=subprocess.PIPE,
@@ -153,13 +154,8 @@ def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
     command: tuple[str, ...], small: Path, rack_name: str
 ) -> None:
     config = upper_of(small, "import os; os._exit(5)")
-    done = subprocess.run(
-        [*RACK, *command, str(config), "--set", f"name={rack_name}"],
-        cwd=small.parent,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-    )
+    words = (*RACK, *command, config, "--set", f"name={rack_name}")
+    done = run_command(words, BOUND_S, cwd=small.parent, text=True)
     reason = "cannot import 'own_upper': ImportError: it ended the process: exit status 5"
     assert (done.returncode, done.stdout) == (2, "")
     # On a slow machine it also says what it waits for.
@@ -170,7 +166,7 @@ def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
 @pytest.mark.slow
 def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_name: str) -> None:
     config = upper_of(small, "while True: pass")
-    process = subprocess.Popen(
+    process = Popen(
         [*RACK, "run", "--no-record", str(config), "--set", f"name={rack_name}"],
         cwd=small.parent,
         stderr=subprocess.PIPE,

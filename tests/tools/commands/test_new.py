@@ -47,18 +47,20 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_written_files_run_and_pass_their_test(kind: str, name: str, tmp_path: Path) -> None:
-    done = rack("new", kind, name, folder=tmp_path)
-    assert f"  rack run {name}/{name}.toml --lockstep --seconds 2\n  pytest {name}\n" in done.stdout
-    run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "2", "--no-record")]
-    done = rack(*run, folder=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name]
+def test_the_written_files_run_and_pass_their_tests(name: str, tmp_path: Path) -> None:
+    names = [f"{name}_{kind}" for kind in KINDS]
+    for kind, each in zip(KINDS, names, strict=True):
+        done = rack("new", kind, each, folder=tmp_path)
+        hint = f"  rack run {each}/{each}.toml --lockstep --seconds 2\n  pytest {each}\n"
+        assert hint in done.stdout
+        run = [*("run", f"{each}/{each}.toml", "--lockstep", "--seconds", "2", "--no-record")]
+        done = rack(*run, folder=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+    test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *names]
     tested = subprocess.run(
         test, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S, check=False
     )
-    assert "1 passed" in tested.stdout, tested.stdout + tested.stderr
+    assert "3 passed" in tested.stdout, tested.stdout + tested.stderr
 
 
 @pytest.mark.slow

@@ -32,6 +32,7 @@ from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts
 from tests.processes import RACK, wait_until
 from tests.tools.machines import A, B, recorded
+from tests.warm import Popen, run_command
 
 pytestmark = pytest.mark.thorough
 
@@ -47,7 +48,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
     with Rack(config) as rack:
         rack.start()
         command = [*RACK, "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
+        with Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
             while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
                 rack.watch(0.1)
@@ -80,21 +81,19 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
     # The rings hold two seconds of simulated time: at this speed a recorder that is late loses
     # nothing.
     settings += ["--set", "clock.speed=0.2"]
-    with subprocess.Popen(
+    with Popen(
         [*RACK, "run", str(small), "--json", *settings],
         stdout=subprocess.DEVNULL,
     ) as process:
         try:
             wait_until(lambda: (run / "run.rrd").is_file(), WATCHDOG_S)
             command = [*RACK, "record", "--save", rack_name, "--out", str(saved), "--json"]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=WATCHDOG_S)
-            status = subprocess.run(
-                [*RACK, "status", rack_name], capture_output=True, text=True, timeout=WATCHDOG_S
-            )
+            done = run_command(command, WATCHDOG_S, text=True)
+            status = run_command([*RACK, "status", rack_name], WATCHDOG_S, text=True)
             assert process.poll() is None
         finally:
             # Not by a signal, which ends it in a hurry.
-            subprocess.run([*RACK, "stop", rack_name], capture_output=True, timeout=WATCHDOG_S)
+            run_command([*RACK, "stop", rack_name], WATCHDOG_S)
     # On a slow machine it says how far it is.
     said = [line for line in done.stderr.splitlines() if not line.startswith("merging the rec")]
     assert (done.returncode, said) == (0, [])
@@ -139,9 +138,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
         folder = tmp_path / "run"
         words = [names[1], "--with", names[0], "--out", str(folder), "--json"]
         command = [*RACK, "record", *words]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT
-        ) as recorder:
+        with Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as recorder:
             deadline = time.monotonic() + WATCHDOG_S
             while (
                 not all((folder / name / "run.rrd").is_file() for name in names)
@@ -209,7 +206,7 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
             stack.enter_context(Rack(config)).start()
         command = [*RACK, "record", names[0], *others, "--out", str(folder), "--json"]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        recorder = stack.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes))
+        recorder = stack.enter_context(Popen(command, cwd=ROOT, **pipes))
         stack.callback(recorder.kill)
         wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
         sent_s = time.monotonic()

@@ -134,13 +134,18 @@ def test_a_trigger_that_fails_or_does_not_fit_is_reported(
 
 
 def go_on(name: str, until: str, ticks: int = 8000) -> None:
-    """Step a rack by 8 ticks until a text is printed, up to a number of ticks, then end its run."""
+    """Step a rack by 8 ticks until a text is printed or the command has ended, up to a number of
+    ticks, then end its run."""
     stepper = Stepper(Segment.attach(name))
     tick = stepper.hold_rack()
+    has_begun = False
     for step in range(0, ticks, 8):
-        # Before the command begins, stdout is pytest's.
-        printed = sys.stdout.getvalue() if isinstance(sys.stdout, StringIO) else ""
-        if until and until in printed:
+        # Before the command begins, and after its end, stdout is pytest's.
+        if isinstance(out := sys.stdout, StringIO):
+            has_begun = True
+            if until and until in out.getvalue():
+                break
+        elif has_begun:
             break
         stepper.run_to(tick + step + 8)
         time.sleep(0.002)

@@ -14,6 +14,7 @@ import pytest
 
 from rack.backplane.segment import SHM_FOLDER
 from tests.processes import BOUND_S, RACK, children_of, named, wait_until
+from tests.warm import Popen
 
 pytestmark = pytest.mark.thorough
 
@@ -35,7 +36,9 @@ class Run:
         small.write_text(text.replace("two_levels:", "tests.two_levels:"))
         self.name, self.folder = name, folder
         seconds = () if moment == "cycle" else ("--seconds", "0.5")
-        self.process = subprocess.Popen(
+        # At other times, a signal may come while the program is still being loaded.
+        start = Popen if moment else subprocess.Popen
+        self.process = start(
             [*RACK, "run", str(small), "--set", f"name={name}", "--out", folder, *seconds],
             cwd=ROOT,
             env={**os.environ, "MOMENT": moment, "SIGNALS": " ".join(str(int(n)) for n in numbers)},

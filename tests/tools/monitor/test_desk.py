@@ -20,6 +20,7 @@ from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, start_rack, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.warm import Popen
 
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[bytes]:
@@ -91,7 +92,7 @@ def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     words = Segment.attach(name).words
     given = words[System.COMMANDED]
     command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    with Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: words[System.COMMANDED] > given)
             yield process, given + 1
@@ -128,7 +129,7 @@ def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
     segment = Segment.attach(running)
     hold = [*RACK, "command", running, "upper", "hold", "--lease"]
     with AttachedRack(running) as live:
-        with subprocess.Popen(hold, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        with Popen(hold, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             line = process.stdout.readline()
             modes = {row.task: row.mode for row in live.status().tasks}
@@ -154,7 +155,7 @@ def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
 def test_a_lease_ends_when_another_command_supersedes_it(running: str) -> None:
     segment = Segment.attach(running)
     upper = [*RACK, "command", running, "upper", "hold", "--lease"]
-    with subprocess.Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    with Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("command ")
         # Refused, so the hold is still in force; then taken.
@@ -218,9 +219,7 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
     path = tmp_path / "told.toml"
     path.write_text(COMMANDED)
     run = ("run", path, "--no-record", "--json", "--seconds", "1", "--set", f"name={rack_name}")
-    held = subprocess.Popen(
-        [*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
+    held = Popen([*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     wait_until(lambda: rack_name in list_racks() and Segment.attach(rack_name).words[System.HELD])
     given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
     assert given.returncode == 0
@@ -265,7 +264,7 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
 ) -> None:
     table = OperatorTable(Segment.attach(running))
     command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
-    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    process = Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     wait_until(table.list_waiting)
     process.send_signal(end)
     process.communicate(timeout=BOUND_S)

@@ -22,6 +22,7 @@ from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
 from tests.processes import RACK
 from tests.tools.command_line import rack
+from tests.warm import Popen
 
 
 @pytest.fixture
@@ -141,7 +142,7 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
 ) -> None:
     with console(hosted, rack_name) as running:
         assert any("--entries RUN repeats a run" in event.text for event in running.events)
-        first = subprocess.Popen(
+        first = Popen(
             [*RACK, "prompt", rack_name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -28,6 +28,7 @@ from rack.tools.viewer.window import find_free_port
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
 from tests.tools.command_line import ROOT, rack
+from tests.warm import Popen
 
 pytestmark = pytest.mark.thorough
 
@@ -69,8 +70,7 @@ def afar(*commands: str) -> list[Ended]:
     """Run commands, each as one text in a process of its own, all at once."""
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     started = [
-        subprocess.Popen([*RACK, *command.split()], cwd=ROOT, text=True, **pipes)
-        for command in commands
+        Popen([*RACK, *command.split()], cwd=ROOT, text=True, **pipes) for command in commands
     ]
     with ExitStack() as stack:
         for process in started:
@@ -92,9 +92,7 @@ def far(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
     command = [*RACK, "run", str(config), "--no-record", f"--set=name={name}"]
     with log.open("w") as out, pytest.MonkeyPatch.context() as patch:
         patch.setenv("RACK_CERTIFICATES", str(folder / "certs"))
-        process = subprocess.Popen(
-            [*command, "--set=clock.mode=realtime"], cwd=ROOT, stdout=out, stderr=out
-        )
+        process = Popen([*command, "--set=clock.mode=realtime"], cwd=ROOT, stdout=out, stderr=out)
         try:
             wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
             assert process.poll() is None, log.read_text()
@@ -109,7 +107,7 @@ def far(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
 def client(*words: str) -> Iterator[subprocess.Popen[str]]:
     """Run a command in a process of its own, which is killed at the end, should it still run."""
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    process = subprocess.Popen([*RACK, *words], cwd=ROOT, text=True, **pipes)
+    process = Popen([*RACK, *words], cwd=ROOT, text=True, **pipes)
     try:
         yield process
     finally:

@@ -25,6 +25,7 @@ from rack.tools.viewer.parts import FILE, list_parts
 from tests.conftest import SMALL
 from tests.machine import run_undisturbed
 from tests.processes import RACK, children_of, wait_until
+from tests.warm import Popen, run_command
 
 pytestmark = [
     pytest.mark.alone,
@@ -75,7 +76,7 @@ def kill_run(folder: Path, name: str, victim: str, seed: int, record: str = "") 
     settings = ["--set", f"name={name}", "--set", "clock.mode=realtime"]
     command = [*RACK, "run", folder / "small.toml", *settings, "--seconds", str(RUN_S)]
     run = folder / "run"
-    process = subprocess.Popen([*command, "--out", run, "--json"], stdout=subprocess.DEVNULL)
+    process = Popen([*command, "--out", run, "--json"], stdout=subprocess.DEVNULL)
     try:
         wait_until(lambda: name in list_racks(), BOUND_S)
         segment = Segment.attach(name)
@@ -106,7 +107,7 @@ def kill_run(folder: Path, name: str, victim: str, seed: int, record: str = "") 
     finally:
         process.kill()
         process.wait()
-        subprocess.run([*RACK, "clean"], check=True, capture_output=True, timeout=BOUND_S)
+        assert run_command([*RACK, "clean"], BOUND_S).returncode == 0
     recording = Recording(run)
     assert recording.events
     for mailbox in recording.mailboxes:
