@@ -7,14 +7,11 @@ the time slice of its plan.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 from rack.boards.timing.tasks import Part, TimedTask, Unit, Urgency, compute_urgency
-
-Variants = Mapping[str, Sequence[Sequence[Part]]]
-"""For each task whose cycles differ, the sequences of parts that its cycles use in rotation."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,6 @@ def simulate_schedule(
     tasks: Sequence[TimedTask],
     until_ns: int,
     context_switch_ns: int = 0,
-    variants: Variants | None = None,
     tick_ns: int | None = None,
 ) -> Chart:
     """Compute the schedule of tasks from time 0.
@@ -110,14 +106,10 @@ def simulate_schedule(
         tasks: The tasks, on any cores. Each is first released at its phase.
         until_ns: End of the schedule.
         context_switch_ns: Time of one context switch.
-        variants: Parts of tasks whose cycles differ. None if every task uses `TimedTask.parts`.
         tick_ns: Length of a tick. Maximum urgency first compares jobs again in each tick, besides
             releases and ends. None if it does not.
     """
-    runners = [
-        _TaskSimulation(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
-        for task in tasks
-    ]
+    runners = [_TaskSimulation(task, context_switch_ns) for task in tasks]
     for core in {task.core for task in tasks}:
         of_core = [runner for runner in runners if runner.task.core == core]
         step_ns = tick_ns or until_ns
@@ -185,14 +177,11 @@ class _TaskSimulation:
         ready_at: Time in ns from which the task's present job, or else its next job, can run.
     """
 
-    def __init__(
-        self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]
-    ) -> None:
+    def __init__(self, task: TimedTask, context_switch_ns: int) -> None:
         self.task = task
         self.spans: list[Span] = []
         self.ready_at = task.phase_ns
         self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []
-        self._variants = variants
         # Remaining steps of the job, and the time already spent on the first of them.
         self._steps: list[Part] = []
         self._spent_ns = 0
@@ -259,8 +248,7 @@ class _TaskSimulation:
         if self.task.role != "planner":
             self._ends |= dict.fromkeys(range(self.ready_at, self._release, every))
         self._slack_ns = self.task.period_ns - every
-        parts = self._variants[self._release // every % len(self._variants)]
-        steps = [part for part in parts if part.time_ns]
+        steps = [part for part in self.task.parts if part.time_ns]
         self._steps = [*self._switch, *steps, *self._switch]
 
     def _find_release(self, now_ns: int) -> int:

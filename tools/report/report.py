@@ -193,7 +193,7 @@ def _build_head(
     return RunReport(
         rack=config.name,
         mode=config.clock.mode,
-        takes_time=config.takes_time,
+        lockstep_load=config.simulated_load,
         speed=config.clock.speed,
         clock_ms=config.clock.period_ms,
         **build_verdict(ended, response),

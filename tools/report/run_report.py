@@ -16,7 +16,7 @@ class RunReport:
     was not recorded, or if it does not apply to the rack.
 
     Attributes:
-        takes_time: Whether computing took time: in real time, or on simulated cores.
+        lockstep_load: Multiple of their budgets that cycles took on simulated cores. 0 without.
         worked: The verdict: True if the run succeeded.
         failures: Reasons why the run failed. Empty if it succeeded.
         unjudged: Aspects that the verdict does not cover.
@@ -30,7 +30,6 @@ class RunReport:
 
     rack: str
     mode: str
-    takes_time: bool
     speed: float
     clock_ms: float
     worked: bool
@@ -45,6 +44,7 @@ class RunReport:
     missed: int
     skipped: int
     others: list[Document]
+    lockstep_load: float | None = None
     folder: str | None = None
     continues: Any = None
     misses: Any = None
@@ -78,6 +78,11 @@ class RunReport:
     bytes_per_s: Any = None
     summary: Any = None
     against: Any = None
+
+    @property
+    def takes_time(self) -> bool:
+        """Whether computing took time: in real time, or on simulated cores."""
+        return self.mode != "lockstep" or bool(self.lockstep_load)
 
     @classmethod
     def from_document(cls, document: Document) -> RunReport:

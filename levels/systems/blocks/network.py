@@ -148,8 +148,9 @@ class BlockNetwork:
             for name, block in self.blocks.items()
         }
         try:
-            order = TopologicalSorter(before).static_order()
-            self._order = [name for name in order if name in self.blocks]
+            order = [n for n in TopologicalSorter(before).static_order() if n in self.blocks]
+            # A delay takes what its source gives in the same cycle.
+            self._order = sorted(order, key=lambda name: self.blocks[name].kind == "delay")
         except CycleError as error:
             path = " > ".join(reversed(error.args[1]))
             raise LevelError(f"{target}={source} closes the cycle {path}; add a delay") from None
@@ -158,18 +159,15 @@ class BlockNetwork:
     def compute_blocks(self, period_s: float) -> bool:
         """Compute all blocks from `values` of the sources. Return the value of `stop.input`."""
         values = self.values
-        blocks = self.blocks
-        delays = [name for name, block in blocks.items() if block.kind == "delay"]
-        # The outputs of delays stand since the previous cycle.
-        others = [name for name in self._order if name not in delays]
         following: dict[str, float] = {}
-        for name in (*others, *delays):
-            block = blocks[name]
+        for name in self._order:
+            block = self.blocks[name]
             kind = KINDS[block.kind]
             output = f"{name}.output"
             inputs = [values[self.wires[f"{name}.{port}"]] for port in kind.inputs]
             result = kind.compute(values[output], inputs, block.value, period_s)
-            (following if name in delays else values)[output] = result
+            # The outputs of delays stand since the previous cycle.
+            (following if block.kind == "delay" else values)[output] = result
         is_stopped = bool(values[self.wires[STOP]])
         values.update(following)
         return is_stopped

@@ -56,7 +56,7 @@ def test_times_of_a_task_follow_equation_3_5() -> None:
     rows = [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)]
     cycles = np.array(rows, RECORD)
     task = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
-    times = compute_task_times(task, cycles, 10 * MS, False, stretches=np.zeros(3), due_ns=10 * MS)
+    times = compute_task_times(task, cycles, 10 * MS, True, stretches=np.zeros(3), due_ns=10 * MS)
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
     assert times["communication_ms"]["max"] == 2.0

@@ -32,16 +32,16 @@ def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimV
         names: Names of the systems.
         records: Record of each system's whole task.
     """
-    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in records]
+    runs = _key_runs(names, records)
     ways = {
         f"{name}_{way}_ms": response
-        for name, run in zip(names, runs, strict=True)
+        for name, run in runs.items()
         if run.response is not None
         for way, response in run.response.ways.items()
         if response.longest_ms is not None
     }
     return rule_on(
-        *check_done(*runs),
+        *check_done(*runs.values()),
         ideal=[
             compare_value(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
             for name, way in ways.items()
@@ -57,10 +57,7 @@ def judge_layers(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVe
         names: Names of the systems.
         records: Record of each system's whole task.
     """
-    levels = {
-        name: (run.disturbed if isinstance(run, TableRuns) else run).levels
-        for name, run in zip(names, records, strict=True)
-    }
+    levels = {name: run.levels for name, run in _key_runs(names, records).items()}
     faster = sum(
         upper > MAX_RATE_RATIO * lower
         for cycles in levels.values()
@@ -70,6 +67,14 @@ def judge_layers(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVe
         compare_value(f"{name}_levels", len(cycles), ">=", 2) for name, cycles in levels.items()
     )
     return rule_on(*counts, *check_none(levels_faster_than_one_below=faster))
+
+
+def _key_runs(names: Iterable[str], records: Iterable[TaskRun | TableRuns]) -> dict[str, TaskRun]:
+    """Return the whole task of each system, keyed by its name."""
+    return {
+        name: run.disturbed if isinstance(run, TableRuns) else run
+        for name, run in zip(names, records, strict=True)
+    }
 
 
 def judge_system(

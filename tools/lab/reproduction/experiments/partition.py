@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -107,17 +108,7 @@ class PartitionFigures:
     off_path_rad: float
 
 
-def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
-    """Run NASREM in every partition, as far as in `SECONDS`."""
-    return _run_partitions(workshop, NAME, SECONDS)
-
-
-def _measure_tasks(workshop: Workshop) -> tuple[PartitionFigures, ...]:
-    """Run a whole task in every partition."""
-    return _run_partitions(workshop, TASK, MAX_TASK_S)
-
-
-def _run_partitions(workshop: Workshop, name: str, seconds: float) -> tuple[PartitionFigures, ...]:
+def _run_partitions(name: str, seconds: float, workshop: Workshop) -> tuple[PartitionFigures, ...]:
     """Run a rack in every partition, for at most `seconds`."""
     config = workshop.load_config(name)
     # Check all configs before the first rack runs.
@@ -135,7 +126,7 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
     tuple[PartitionFigures, ...],
-    _measure_partitions,
+    partial(_run_partitions, NAME, SECONDS),
     cores=2,
 )
 TASKS = Experiment(
@@ -143,7 +134,7 @@ TASKS = Experiment(
     "the same task with its planners on one core and on two",
     len(PARTITIONS) * (TASK_S + LAUNCH_S),
     tuple[PartitionFigures, ...],
-    _measure_tasks,
+    partial(_run_partitions, TASK, MAX_TASK_S),
     cores=2,
 )
 
