@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
+from pathlib import Path
+from socket import socketpair
 from time import process_time_ns
 from types import SimpleNamespace
 
 import pytest
 
-from rack.backplane.process import busy_wait_until
+from rack.backplane.process import busy_wait_until, name_process
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
+from rack.boards.errors import SnapshotError
+from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
@@ -78,3 +84,24 @@ def test_no_snapshot_is_taken_without_a_request(segment: Segment) -> None:
     copies, copier = copies_of(segment)
     assert min(copies(tick) for tick in range(50)) > 1 << 60
     assert copier.ticks == []
+
+
+def test_a_copy_has_its_own_name_before_it_runs(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    comm = Path("/proc/self/task", str(os.getpid()), "comm")
+    before, seen = comm.read_text(), list[str]()
+
+    def refuse() -> int:
+        seen.append(comm.read_text().strip())
+        raise OSError(errno.EAGAIN, "no more processes")
+
+    monkeypatch.setattr(Copier, "_list_obstacles", lambda self, memory: [])
+    monkeypatch.setattr(os, "fork", refuse)
+    here, there = socketpair()
+    with here, there, pytest.raises(SnapshotError, match="level: cannot be copied: no more"):
+        Copier(segment, "level", there).fork_copy(3)
+    seen.append(comm.read_text().strip())
+    name_process(before.strip())
+    # A copy has the name that its parent has at the fork.
+    assert seen == ["copy:level", f"{segment.rack}:level"[:15]]

@@ -58,7 +58,7 @@ class Bench:
 
     def run(self, plan: Plan, whole: bool = False, seconds: float = SECONDS) -> Trial:
         """Run a plan."""
-        start = Start() if whole else self.base.find_start(plan, self.crate)
+        start = Start(whole="as asked") if whole else self.base.find_start(plan, self.crate)
         return run_trial(
             self._config, plan, self.base.name, 0, seconds, start=start, crate=self.crate
         )
