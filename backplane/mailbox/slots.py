@@ -186,10 +186,9 @@ class Slots:
                 break
 
     def find_newest(self) -> int:
-        """Return the serial of the newest message that lawful writers have published.
+        """Return the serial of the newest message that the claimant of the mailbox has published.
 
-        It differs from the head if a writer that was stopped and replaced has published since. That
-        writer sets the head at most to the first serial of its successor.
+        The head differs from it if a writer that was stopped and replaced has published since.
         """
         claimant = self.box[Box.CLAIMANT]
         begun = self.box[Box.BEGUN + get_epoch(claimant) % Box.EPOCHS]
@@ -197,8 +196,10 @@ class Slots:
         head = max(self.box[Box.HEAD], begun)
         own = (words[_SERIAL] for words in self.heads if words[_EPOCH] == claimant)
         newest = max(own, default=begun)
+        # The slot of a lost message still contains an older one.
+        is_lost = self.heads[head & self.mask][_SERIAL] == head - self.depth
         is_set_back = newest > head + 1
-        is_set_ahead = newest == begun == head - 1
+        is_set_ahead = newest < head and not is_lost
         return newest if is_set_back or is_set_ahead else head
 
     def clear_unpublished(self, head: int) -> None:

@@ -6,7 +6,7 @@ In every round a new process takes over two mailboxes and publishes in both, whi
 the round before may still live. It kills or stops itself before one of its stores: every store of
 claim and publication has its turn. A stopped process continues while its successor takes over, or
 after the successor has published. It then makes its remaining stores and, if it still believes that
-it may write, publishes once more. Two processes read all the time.
+it may write, publishes once more. This process reads after each round, another one all the time.
 
 The result, as JSON, counts what must not happen. `double`: two processes that both believed to be
 the writer in one epoch. `torn`: messages returned to a reader that nobody wrote like that. `stale`:
@@ -123,7 +123,11 @@ class Round:
         writers = {name: open_standby_writer(segment, name) for name in BOXES}
         copy = COPIES[number % len(COPIES)]
         wiring: Any = SimpleNamespace(task=copy, votes=False)
-        outputs: Any = SimpleNamespace(writers=writers)
+        ports = [
+            SimpleNamespace(writer=writer, find_content=lambda tick, w=writer: w.message.raw)
+            for writer in writers.values()
+        ]
+        outputs: Any = SimpleNamespace(writers=writers, ports=ports)
         level: Any = SimpleNamespace()
         self._replica = Replica(segment, wiring, outputs, level, AlarmWriter(segment, copy))
         self.writers = tuple(writers.values())
@@ -309,8 +313,10 @@ class HandOvers:
 
     def _read_now(self) -> None:
         """Read everything as a board does, and as a recorder."""
-        for check in self._checks:
+        for box, check in enumerate(self._checks):
             check.read()
+            # A stopped process may have set the head to what its successor has filled.
+            self.rounds["has_published"][check.newest, box] = 1
         for ring, check in zip(self._rings, self._history, strict=True):
             for row in ring.read_new_rows().rows:
                 content = [int(value) for value in row["message"]["row"]]

@@ -1,0 +1,55 @@
+"""Hand-overs one after the other, each cut short at a store to shared memory, while others read."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+
+import pytest
+
+from tests.conftest import EXHAUSTIVE
+from tests.processes import BOUND_S
+
+pytestmark = pytest.mark.slow
+ROUNDS = 110_000 if EXHAUSTIVE else 330
+MUTANT_ROUNDS = 500
+LIMIT_S = 4 * 3600.0 if EXHAUSTIVE else 4 * BOUND_S
+WRONG = ("torn", "stale", "missing", "double")
+
+
+def hand_over(rack: str, rounds: int, cripple: str = "") -> Mapping[str, int]:
+    """Return the counts of some rounds of hand-overs, one of whose safeguards is crippled."""
+    command = [sys.executable, "-m", "tests.boards.run.hand_overs", rack, str(rounds)]
+    done = subprocess.run(
+        [*command, *filter(None, [cripple])],
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found: Mapping[str, int] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.timeout(LIMIT_S)
+def test_no_hand_over_tears_a_message_or_makes_two_writers(rack_name: str) -> None:
+    found = hand_over(rack_name, ROUNDS)
+    assert {name: found[name] for name in WRONG} == dict.fromkeys(WRONG, 0)
+    # Each store between claim and publication is the last one of some process.
+    assert found["stores"] > 60
+    assert found["rounds"] > 3 * found["stores"]
+    assert found["hand_overs"] > 0.8 * ROUNDS
+    assert min(found["killed"], found["stopped"]) > 0.3 * ROUNDS
+    assert min(found["continued at once"], found["continued too late"]) > 0.1 * ROUNDS
+    assert found["read"] > ROUNDS
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("cripple", "wrong"), [("lock", "double"), ("claim", "stale"), ("checksum", "torn")]
+)
+def test_a_missing_safeguard_is_found(rack_name: str, cripple: str, wrong: str) -> None:
+    assert hand_over(rack_name, MUTANT_ROUNDS, cripple)[wrong] > 0
