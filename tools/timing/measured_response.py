@@ -275,7 +275,7 @@ def find_origins(
         {
             **messages.parts,
             rack: all_far_ms - sum(messages.parts.values()),
-            f"link {path.port}": all_link_ms,
+            f"link to {path.stations[-1][0]}": all_link_ms,
         },
         messages.uncertainty_ms,
         messages.gaps,
