@@ -2,8 +2,8 @@
 
 The status of an adapter contains the serial of each message that it imported, which finds the
 message in the recording of the rack that wrote it. Its ticks are converted to the importing rack by
-the recorded clock comparisons. A bound is exceeded, or held, only if that is certain despite the
-uncertainty of these comparisons.
+the recorded clock comparisons. A bound counts as held only if that is certain despite their
+uncertainty.
 """
 
 from __future__ import annotations
