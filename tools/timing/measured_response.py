@@ -32,7 +32,7 @@ from rack.tools.timing.chain_response import NOT_MEASURED, BoardChain, Origins, 
 LOSSES = {
     "missing": "were lost before it",
     "late": "were older than max_age_ms before it",
-    "superseded": "arrived no earlier than it",
+    "superseded": "were overtaken on the way",
 }
 """Counts of an import whose messages did not get through, and how they got lost."""
 
