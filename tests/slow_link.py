@@ -13,6 +13,7 @@ from asyncio import StreamReader, StreamWriter
 from contextlib import suppress
 
 HOST = "127.0.0.1"
+ANY = "0.0.0.0"
 MOST_BYTES = 1 << 16
 
 
@@ -52,7 +53,7 @@ async def serve(listen_port: int, target_port: int, delay_s: float) -> None:
             return
         await asyncio.gather(relay(reader, back, delay_s), relay(there, writer, delay_s))
 
-    server = await asyncio.start_server(connect, HOST, listen_port)
+    server = await asyncio.start_server(connect, ANY, listen_port)
     await server.serve_forever()
 
 

@@ -20,13 +20,14 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config import CONFIGS, load
 from rack.levels.operator import Answer
-from rack.tools.viewer.window import find_free_port
 from tests import golden
 from tests.boards.lan.racks import ended, running, watch
 from tests.machine import needs_lab
+from tests.network_lab import Lab
 from tests.processes import RACK, wait_until
 from tests.snapshots import Snapshots
 from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY
+from tests.tools.command_line import ROOT, rack
 
 SNAPSHOTS = Snapshots(__file__)
 LINK_OUT = """
@@ -46,6 +47,8 @@ LOSS = ("peer_lost", "demand")
 REFUSED = "it ran in real time on a network, but only lockstep runs can be repeated"
 HELD = "no reference from 'lan': held after 5 extrapolated"
 MOVING_RAD_S = 0.05
+NEAR, FAR = 7447, 7448
+"""Ports of the relay and of the servo rack, on a machine of its own."""
 MOST_S = 120.0
 """Longest time for the launch of both racks, or for a whole run, on a busy machine."""
 
@@ -315,45 +318,62 @@ def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
     (order,) = find_responses(lower, "command", f"{rack_name}-servo/arm")
     assert status["levels"][0] == f"{rack_name}-servo/arm"
     assert order["levels"][0] == f"{rack_name}/trajectory"
-    for response in (status, order):
+    found = rack(
+        "analyze", tmp_path / upper["folder"], tmp_path / upper["others"][0]["folder"], "--json"
+    )
+    across = [one for one in json.loads(found.stdout)["across"] if one["count"]]
+    assert found.returncode == 0
+    for response in (status, order, *across):
         assert response["measured_ms"]["max"] == pytest.approx(response["bound_ms"])
         assert response["holds"]
+    ends = {(one["levels"][0], one["levels"][-1]): one["parts"] for one in across}
+    # The wait for the next exchange, and what the racks and the link take in lockstep.
+    assert ends[f"{rack_name}-servo/arm", f"{rack_name}/planning"] == {
+        "waiting for new information": 19.0,
+        f"{rack_name}-servo": 2.0,
+        f"link to {rack_name}": 2.0,
+        rack_name: 220.0,
+    }
 
 
 @pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("delay_ms", [0, 5, 30])
+@needs_lab
+@pytest.mark.parametrize("delay_ms", [0, 5, 20, 50])
 def test_on_a_slow_network_each_long_response_has_a_cause(
     delay_ms: int, rack_name: str, tmp_path: Path
 ) -> None:
     servo, general = configs(rack_name, tmp_path)
-    near, far = find_free_port(), find_free_port()
-    relay = [sys.executable, "-m", "tests.slow_link", str(near), str(far), str(delay_ms)]
+    relay = [sys.executable, "-m", "tests.slow_link", str(NEAR), str(FAR), str(delay_ms)]
     shared = ["--share", "--json", "--seconds", "6", "--set", "adapter.lan.insecure=true"]
     shared += ["--set", "adapter.lan.estop_from=[]"]
-    listening = ["--set", f'adapter.lan.listen=["tcp/127.0.0.1:{far}"]']
-    connecting = ["--set", f'adapter.lan.connect=["tcp/127.0.0.1:{near}"]']
     alone = ["--set", "adapter.lan.launch=[]", "--set", 'adapter.lan.partners=["servo.toml"]']
-    runs = (
-        [*RACK, "run", servo, *shared, *listening, "--out", "lower"],
-        [*RACK, "run", general, *shared, *connecting, *alone, "--out", "upper"],
-    )
-    link = subprocess.Popen(relay)
-    try:
+    with Lab(2) as lab:
+        listening = ["--set", f'adapter.lan.listen=["tcp/127.0.0.1:{FAR}"]']
+        connecting = ["--set", f'adapter.lan.connect=["tcp/{lab.address(0)}:{NEAR}"]']
+        runs = (
+            [*RACK, "run", str(servo), *shared, *listening, "--out", "lower"],
+            [*RACK, "run", str(general), *shared, *connecting, *alone, "--out", "upper"],
+        )
+        lab.popen(0, relay, cwd=ROOT)
         started = [
-            subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for run in runs
+            lab.popen(machine, run, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+            for machine, run in enumerate(runs)
         ]
         lower, upper = (json.loads(one.communicate(timeout=MOST_S)[0]) for one in started)
-    finally:
-        link.kill()
-        link.wait()
     (status,) = find_responses(upper, "status", f"{rack_name}/planning")
     (order,) = find_responses(lower, "command", f"{rack_name}-servo/arm")
-    for response in (status, order):
+    found = rack("analyze", tmp_path / "upper", tmp_path / "lower", "--json")
+    across = [one for one in json.loads(found.stdout)["across"] if one["count"]]
+    assert {one["direction"] for one in across} == {"command", "status"}
+    # A response of one run begins too early by up to the uncertainty of the clocks.
+    for response in (status, order, *across):
         assert response["measured_ms"]["max"] > 0.0
         assert all(one["delayed_by"] or one["network"] for one in response["beyond"])
+    assert found.returncode == any(one["beyond"] for one in across)
+    causes = [cause for one in across for excess in one["beyond"] for cause in excess["network"]]
+    # The budget of the link is 20 ms.
     if delay_ms > 20:
-        # The budget of the link is 20 ms.
-        causes = [cause for excess in order["beyond"] for cause in excess["network"]]
+        assert not any(one["holds"] for one in across)
         assert any(cause.startswith("the link took ") for cause in causes)

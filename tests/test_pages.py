@@ -87,6 +87,7 @@ OTHER_TESTS = {
     "rack run cell/k1607 --share": "test_cell_page.py",
     "rack run cell --share": "test_cell_page.py",
     "rack replay runs/<puma> runs/<k1607>": "tools/viewer/test_merged.py",
+    "rack analyze runs/<brown> runs/<brown-servo>": "test_brown_network.py",
     "rack prompt chimera": "tools/monitor/test_host_side.py",
     "rack command chimera trajectory schedule earliest-deadline-first": "test_chimera.py",
     "rack estop 10.0.0.1/cell": "tools/network/test_estop.py",

@@ -49,8 +49,8 @@ def analyze(
     responses across these racks. It follows each message through all of them, and compares the
     longest response along each path with its bound (`rack check` with several configs). It shows
     where the longest response spent its time, and why bounds were exceeded: lost messages, a delay
-    beyond delay_ms, or late cycles and boards, by rack. In real time a bound counts as exceeded if
-    it is exceeded by more than the uncertainty of the clock comparison.
+    beyond delay_ms, or late cycles and boards, by rack. In real time, a bound counts as held only
+    if that is certain despite the uncertainty of the clock comparison.
 
     Exit status: 0 every equation or bound held; 1 one failed; 2 the runs cannot be analyzed.
 

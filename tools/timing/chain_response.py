@@ -143,7 +143,6 @@ def _measure_chain(recording: Recording, chain: BoardChain, bound_ms: float) -> 
         gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
         is_seen = gaps[at[1:]] == gaps[at[:-1]]
     uncertainty_ms = origins.uncertainty_ms if origins else 0.0
-    limit_ms = bound_ms + uncertainty_ms + tick_ms / 2
     parts: dict[str, float] = {}
     if origins is not None:
         is_seen &= np.diff(origins.gaps[messages]) == 0
@@ -161,7 +160,7 @@ def _measure_chain(recording: Recording, chain: BoardChain, bound_ms: float) -> 
             "delayed_by": [*list_delays(recording, boards, int(arrived[k]), int(acts[k]))],
             "network": [] if origins is None else [*origins.list_delays(*arrived[k : k + 2])],
         }
-        for k in np.flatnonzero(is_seen & (ms > limit_ms))
+        for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
     ]
     unseen = int(np.count_nonzero(~is_seen))
     return ChainResponses(ms[is_seen], beyond, unseen, parts, uncertainty_ms)

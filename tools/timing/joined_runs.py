@@ -2,8 +2,8 @@
 
 The status of an adapter contains the serial of each message that it imported, which finds the
 message in the recording of the rack that wrote it. Its ticks are converted to the importing rack by
-the recorded clock comparisons. A bound is exceeded, or held, only if that is certain despite the
-uncertainty of these comparisons.
+the recorded clock comparisons. A bound counts as held only if that is certain despite their
+uncertainty.
 """
 
 from __future__ import annotations
@@ -152,14 +152,14 @@ def _match_messages(
     assert entries is not None, "it has imports"
     sent = other.read_rows(entries.imports[port].partition("/")[2])
     got = recording.read_rows(f"{ADAPTER}.{port}")
-    messages = messages.select(
-        np.isin(messages.serials, sent["serial"]) & np.isin(messages.taken, got["tick"])
-    )
+    messages = messages.select(np.isin(messages.serials, sent["serial"]))
     sent = sent[np.searchsorted(sent["serial"], messages.serials)]
-    got = got[np.searchsorted(got["tick"], messages.taken)]
-    if not len(sent) or any(
-        sent["message"][name].tobytes() != got["message"][name].tobytes()
-        for name in got["message"].dtype.names or ()
+    # A fault may keep a message that was taken from the mailbox.
+    both = np.isin(messages.taken, got["tick"])
+    pairs = sent[both], got[np.searchsorted(got["tick"], messages.taken[both])]
+    first, second = (rows["message"] for rows in pairs)
+    if not len(first) or any(
+        first[name].tobytes() != second[name].tobytes() for name in first.dtype.names or ()
     ):
         raise Failure(
             f"{recording.folder} and {other.folder} are not of the same run: they have no message"

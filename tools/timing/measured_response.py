@@ -32,7 +32,7 @@ from rack.tools.timing.chain_response import NOT_MEASURED, BoardChain, Origins, 
 LOSSES = {
     "missing": "were lost before it",
     "late": "were older than max_age_ms before it",
-    "superseded": "arrived no earlier than it",
+    "superseded": "were overtaken on the way",
 }
 """Counts of an import whose messages did not get through, and how they got lost."""
 
@@ -275,7 +275,7 @@ def find_origins(
         {
             **messages.parts,
             rack: all_far_ms - sum(messages.parts.values()),
-            f"link {path.port}": all_link_ms,
+            f"link to {path.stations[-1][0]}": all_link_ms,
         },
         messages.uncertainty_ms,
         messages.gaps,

@@ -1,0 +1,241 @@
+"""Responses across three racks in a row, measured from their recordings, and refused recordings."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config.joined import join_racks
+from rack.tools.recording.checksums import Checksums
+from rack.tools.recording.recording import Recording
+from rack.tools.timing.joined_runs import format_joined_runs, measure_joined_runs
+from tests.processes import RACK
+from tests.shared_runs import small_run
+from tests.tools.command_line import rack
+
+pytestmark = pytest.mark.slow
+
+MOST_S = 200.0
+NAME = "test-three"
+RACKS = ("top", "middle", "bottom")
+LAN = """
+[adapter.lan]
+slot = 6
+rate_hz = 100
+"""
+IMPORT = """
+[adapter.lan.import.order]
+from = "{rack}/relay.command"
+type = "order_levels:Order"
+rate_hz = 50
+max_age_ms = 1000
+delay_ms = 20
+"""
+EXPORT = """
+[adapter.lan.export.order]
+from = "relay.command"
+rate_hz = 50
+"""
+BOARDS = {
+    "top": """
+[board.source]
+slot = 2
+rate_hz = 25
+below = "relay"
+executor = "order_levels:Source"
+
+[board.relay]
+slot = 3
+rate_hz = 50
+above = "source"
+executor = "order_levels:Relay"
+""",
+    "middle": """
+[board.relay]
+slot = 2
+rate_hz = 50
+executor = "order_levels:Relay"
+reads = { above = "lan.order" }
+""",
+    "bottom": """
+[board.relay]
+slot = 2
+rate_hz = 100
+below = "sink"
+executor = "order_levels:Relay"
+reads = { above = "lan.order" }
+
+[board.sink]
+slot = 3
+rate_hz = 50
+above = "relay"
+executor = "order_levels:Sink"
+""",
+}
+FAULTS = {
+    "middle": """
+[[fault]]
+kind = "delay"
+board = "relay"
+mailbox = "relay.command"
+by = 8
+at = 1.0
+for = 0.4
+""",
+    "bottom": """
+[[fault]]
+kind = "mute"
+board = "lan"
+mailbox = "lan.order"
+at = 2.0
+for = 0.2
+""",
+}
+
+
+def write_configs(folder: Path, faults: dict[str, str]) -> dict[str, Path]:
+    """Write the configs of three racks, the first of which launches the others.
+
+    With faults, the source has another rate, so that orders are not those of a run without faults.
+    """
+    paths = {}
+    for number, rack_ in enumerate(RACKS):
+        others = [f"unix/{NAME}-{one}" for one in RACKS[:number]]
+        lan = f'{LAN}listen = ["unix/{NAME}-{rack_}"]\nconnect = {json.dumps(others)}\n'
+        # In lockstep, racks that exchange messages wait for each other.
+        lan += (
+            f"peers = {json.dumps([f'{NAME}-{one}' for one in RACKS[number + 1 : number + 2]])}\n"
+        )
+        if number == 0:
+            lan += 'launch = ["middle.toml", "bottom.toml"]\n'
+        head = f'format = 2\nname = "{NAME}-{rack_}"\npython_path = ["{Path(__file__).parent}"]\n'
+        head += "\n[clock]\nperiod_ms = 2.5\n"
+        tables = [IMPORT.format(rack=f"{NAME}-{RACKS[number - 1]}")] if number else []
+        tables += [EXPORT] if number < 2 else []
+        paths[rack_] = folder / f"{rack_}.toml"
+        text = "".join((head, BOARDS[rack_], lan, *tables, faults.get(rack_, "")))
+        paths[rack_].write_text(text.replace("= 25", "= 50") if faults else text)
+    return paths
+
+
+def run_racks(folder: Path, faults: dict[str, str]) -> dict[str, Path]:
+    """Run the three racks in lockstep, and return their recordings."""
+    configs = write_configs(folder, faults)
+    command = [*RACK, "run", configs["top"], "--lockstep", "--seconds", "3", "--share"]
+    done = subprocess.run(
+        [*command, "--json", "--out", "top"],
+        cwd=folder,
+        timeout=MOST_S,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0 or faults, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    found = {one["rack"].rpartition("-")[2]: folder / one["folder"] for one in report["others"]}
+    return {"top": folder / "top", **found}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return run_racks(tmp_path_factory.mktemp("plain"), {})
+
+
+@pytest.fixture(scope="module")
+def faulty_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return run_racks(tmp_path_factory.mktemp("faulty"), FAULTS)
+
+
+def measure(runs: dict[str, Path]) -> dict[str, Any]:
+    (found,) = measure_joined_runs([Recording(runs[rack_]) for rack_ in RACKS])
+    return found
+
+
+def test_a_command_is_followed_through_all_racks_to_its_bound(runs: dict[str, Path]) -> None:
+    found = measure(runs)
+    names = [f"{NAME}-{rack_}" for rack_ in RACKS]
+    recordings = {name: Recording(runs[rack_]) for name, rack_ in zip(names, RACKS, strict=True)}
+    layouts = {name: recording.layout for name, recording in recordings.items()}
+    joined = join_racks([each.rack_config for each in recordings.values()], layouts)
+    (chain,) = joined.chains
+    assert list(map(str, chain)) == list(found["levels"])
+    assert (str(chain[0]), str(chain[-1])) == (f"{names[0]}/source", f"{names[2]}/sink")
+    assert found["bound_ms"] == pytest.approx(joined.compute_response_ns(chain) * 1e-6)
+    assert (found["holds"], found["beyond"], found["uncertainty_ms"]) == (True, [], 0.0)
+    assert found["count"] > 40
+    assert found["measured_ms"]["max"] <= found["bound_ms"]
+    assert sum(found["parts"].values()) == pytest.approx(found["measured_ms"]["max"])
+    links = {f"link to {name}" for name in names[1:]}
+    assert {*found["parts"]} == {*names, *links, "waiting for new information"}
+    # A cycle of the last relay, the wait for the sink, and its cycle.
+    assert found["parts"][names[-1]] <= 10 + 10 + 10 + 20 + 20
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "cause"),
+    [
+        (1.0, "test-three-middle: fault: delay of relay"),
+        (2.0, "fault: mute of lan"),
+    ],
+)
+def test_a_response_beyond_its_bound_names_the_rack_and_the_cause(
+    faulty_runs: dict[str, Path], begin_s: float, cause: str
+) -> None:
+    found = measure(faulty_runs)
+    assert found["holds"] is False
+    first = begin_s / 2.5e-3
+    near = [one for one in found["beyond"] if first - 80 < one["tick"] < first + 200]
+    assert near
+    assert all(cause in (*one["network"], *one["delayed_by"]) for one in near), near
+    lines = [*format_joined_runs([found])]
+    assert lines[0] == "across racks: 0 of 1 responses held their bounds, 1 failed"
+    assert any(line.endswith(cause) for line in lines)
+    assert "FAILS: command: at most" in lines[1]
+
+
+def remove_budget(run: Path, folder: Path) -> Path:
+    """Return a copy of a run whose links have no delay budget."""
+    shutil.copytree(run, folder)
+    config = folder / "config.toml"
+    lines = config.read_text().splitlines(keepends=True)
+    config.write_text("".join(line for line in lines if not line.startswith("delay_ms")))
+    Checksums(folder).store("config.toml")
+    return folder
+
+
+def test_recordings_that_do_not_belong_together_are_refused(
+    runs: dict[str, Path],
+    faulty_runs: dict[str, Path],
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    unbudgeted = remove_budget(runs["middle"], tmp_path / "unbudgeted")
+    cases: dict[str, tuple[Sequence[Path], str]] = {
+        "another cell": (
+            [runs["top"], small_run(tmp_path_factory)],
+            "no command passes between 'test-three-top' and the other racks given",
+        ),
+        "middle missing": (
+            [runs["top"], runs["bottom"]],
+            "it exchanges messages with test-three-middle",
+        ),
+        "twice": ([runs["top"], runs["top"]], "give one RUN of each rack; these are of"),
+        "another run": (
+            [runs["top"], faulty_runs["middle"]],
+            "are not of the same run: they have no message of adapter.lan.import.order in common",
+        ),
+        "no budget": (
+            [runs["top"], unbudgeted],
+            "rack test-three-middle: adapter.lan.import.order has no delay_ms",
+        ),
+    }
+    for name, (folders, said) in cases.items():
+        done = rack("analyze", *folders)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1), name
+        assert said in done.stderr, name
