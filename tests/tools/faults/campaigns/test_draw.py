@@ -73,7 +73,7 @@ def test_every_kind_is_drawn_as_often_as_asked_for(
     wanted = [kind for kind in kinds if not (lockstep and needs_real_time(kind))]
     assert +found == Counter(dict.fromkeys(wanted, COUNT))
     # Nothing of the default rack has protocol lock, or tendons.
-    assert set(KINDS.names) - set(kinds) == {"lock-held", "tendon-torn"}
+    assert set(KINDS.names) - set(kinds) == {"lock-held", "tendon-torn", "wrong-output"}
 
 
 @pytest.mark.parametrize("lockstep", BOTH)
