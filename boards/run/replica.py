@@ -22,7 +22,6 @@ from collections.abc import Iterable, Sequence
 from xxhash import xxh3_64_intdigest
 
 from rack.backplane.address_map import SLOT_HEAD_SIZE
-from rack.backplane.byte_lock import ByteLock
 from rack.backplane.checked import to_enum
 from rack.backplane.mailbox.protocols import open_standby_writer
 from rack.backplane.mailbox.slots import Slots
@@ -32,6 +31,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Box, HandOver, Run, Slot, System
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.boards.run.ports import OutputPort, OutputPorts
+from rack.boards.run.writing_right import WritingRight
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor
 
@@ -122,15 +122,13 @@ class ReplicatedLoop(VirtualControlLoop):
         self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None
     ) -> None:
         super().__init__(segment, wiring, executor, attention)
-        self._layout = layout = segment.layout
-        board = self.spec.board
+        self._layout = segment.layout
         self._compares = wiring.compares
         self._votes = wiring.votes
-        self._number = layout.list_copies(board).index(self.spec)
-        self._group = segment.get_block(board)
-        self._blocks = segment.get_copy_blocks(board)
-        self._lock = ByteLock(segment.fd, segment.map.blocks[board] + 8 * Block.ACTIVE)
-        self._writers = tuple(self.outputs.writers.values())
+        writers = tuple(self.outputs.writers.values())
+        self.right = WritingRight(segment, self.spec, writers, self.alarms)
+        self._group = self.right.group
+        self._blocks = segment.get_copy_blocks(self.spec.board)
         self._outputs = [ReplicatedOutput(segment, port) for port in self.outputs.ports]
         self._held_tick: int | None = None  # last cycle whose messages were held back
         self._late = self._quiet_until = -1
@@ -140,22 +138,17 @@ class ReplicatedLoop(VirtualControlLoop):
         self.write_command_and_status = self._write_or_hold
         self.next_cycle.serve_request = self.serve_request
         self.block[Block.ALIGNED] = 0
-        if self._is_first and self._number == 0:
-            self._take_over(0, HandOver.NONE)
-
-    @property
-    def is_active(self) -> bool:
-        """True if this copy writes the mailboxes."""
-        return bool(self._group[Block.ACTIVE] == self._number)
+        if self._is_first and self.right.number == 0:
+            self.right.take(0, HandOver.NONE)
 
     def serve_request(self) -> None:
         """Take over if the clock requests it from this copy. Called between two cycles."""
         group = self._group
-        if group[Block.TAKE_OVER] != self._number + 1:
+        if group[Block.TAKE_OVER] != self.right.number + 1:
             return
-        if not self.is_active:
+        if not self.right.is_held:
             tick = self.words[System.TICK]
-            if not self._take_over(tick, to_enum(HandOver, group[Block.TAKE_OVER_REASON])):
+            if not self.right.take(tick, to_enum(HandOver, group[Block.TAKE_OVER_REASON])):
                 return
             if self._held_tick is not None:
                 now = None if self.clock.is_lockstep else tick
@@ -167,37 +160,25 @@ class ReplicatedLoop(VirtualControlLoop):
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""
         self.serve_request()
-        if self.is_active:
-            self._keep_claims(tick)
+        if self.right.is_held:
+            self.right.keep(tick)
         else:
             self._follow_active_copy(tick)
         super().cycle(tick)
-
-    def _keep_claims(self, tick: int) -> None:
-        """Claim the mailboxes if this is a new process or a standby has died while taking over."""
-        if all(writer.claim.is_valid for writer in self._writers):
-            for writer in self._writers:
-                writer.claim.try_lock()
-        elif not self._group[Block.TAKE_OVER]:
-            # Otherwise the clock has asked another copy to take over from an earlier process.
-            self._take_over(tick, HandOver.LOST)
 
     def _follow_active_copy(self, tick: int) -> None:
         """Compare this copy with the active one before a cycle, and realign it if necessary.
 
         In real time, take over instead if the active copy is lost or late.
         """
-        for writer in self._writers:
-            # Another copy may have taken over while this one was late or stopped.
-            if writer.claim.is_taken:
-                writer.claim.release()
+        self.right.release()
         held = tick - self.spec.every
         if self._held_tick != held:
             self.block[Block.ALIGNED] = 0
             self._realign(held)
             return
         if not self.clock.is_lockstep and (reason := self._find_loss(held)):
-            self._take_over(tick, reason)
+            self.right.take(tick, reason)
             return
         late = sum(block[Block.MISSED] + block[Block.SKIPPED] for block in self._blocks)
         if late != self._late:
@@ -265,11 +246,11 @@ class ReplicatedLoop(VirtualControlLoop):
         active = self._group[Block.ACTIVE]
         word = self._find_vote_word(tick)
         for number, block in enumerate(self._blocks):
-            if number not in (active, self._number):
+            if number not in (active, self.right.number):
                 if block[word] == self.block[word]:
                     return active
                 if block[word] == compute_vote(tick, (output.published for output in due)):
-                    return self._number
+                    return self.right.number
         return None
 
     def _find_vote_word(self, tick: int) -> int:
@@ -288,7 +269,7 @@ class ReplicatedLoop(VirtualControlLoop):
 
     def _write_or_hold(self, tick: int, now: int | None) -> bool:
         """Write the messages of a cycle if this copy is active, and hold them back otherwise."""
-        if self.is_active and all(writer.claim.is_valid for writer in self._writers):
+        if self.right.permits_writing:
             return self._write(tick, now)
         self._held_tick = tick
         due = self._list_due(tick)
@@ -299,41 +280,9 @@ class ReplicatedLoop(VirtualControlLoop):
             self.block[self._find_vote_word(tick)] = vote
         return True
 
-    def _take_over(self, tick: int, reason: HandOver) -> bool:
-        """Claim the mailboxes, and become the active copy.
-
-        Args:
-            tick: Tick from which this copy writes.
-            reason: Reason for the hand-over.
-
-        Returns:
-            False if another copy is taking over, or has been killed or stopped in doing so. Then
-            try again in the next cycle.
-        """
-        group = self._group
-        active = group[Block.ACTIVE]
-        if not self._lock.take():
-            return False
-        try:
-            if group[Block.ACTIVE] == active:
-                for writer in self._writers:
-                    writer.take_over()
-                if active != self._number:
-                    group[Block.ACTIVE_SINCE] = tick
-                    group[Block.HAND_OVER] = reason
-                    group[Block.HAND_OVERS] += 1
-                    index = self._layout.processes.index(self.spec)
-                    self.alarms.raise_alarm(tick, Alarm.TAKEN_OVER, index, reason)
-                self.block[Block.ALIGNED] = 0
-                # From here on the other copies hold their messages back.
-                group[Block.ACTIVE] = self._number
-        finally:
-            self._lock.release()
-        return self.is_active
-
     def _report_findings(self, tick: int) -> None:
         """Report findings if this copy is active. Otherwise drop them."""
-        if not self.is_active:
+        if not self.right.is_held:
             self.executor.findings.clear()
             self.executor.acted.clear()
         super()._report_findings(tick)

@@ -27,6 +27,7 @@ DIMENSIONLESS = {
     *("damping", "braking", "tolerance", "bring_up", "ratio"),
     *("quaternion", "direction", "x", "z"),
     *("probability", "random", "bits", "part", "factor", "joint", "writes", "killed"),  # of faults
+    "offset",  # in the unit of the field
     *("lead", "posture", "reserve"),  # of hands: parts and factors
     "for",  # s, or text with its unit
 }

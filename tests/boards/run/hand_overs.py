@@ -25,7 +25,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from random import Random
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ from rack.backplane.mailbox.slots import Slots, get_epoch, get_pid
 from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Box, HandOver, Run, System
-from rack.boards.run.replica import Replica
+from rack.boards.run.writing_right import WritingRight
 from tests.backplane.bus import layout, mailbox, task
 from tests.backplane.mailbox.mines import Bomb, MinedBox, mine
 from tests.processes import fork, forked
@@ -122,31 +121,25 @@ class Round:
         notes["pid"] = os.getpid()
         writers = {name: open_standby_writer(segment, name) for name in BOXES}
         copy = COPIES[number % len(COPIES)]
-        wiring: Any = SimpleNamespace(task=copy, votes=False)
-        ports = [
-            SimpleNamespace(writer=writer, find_content=lambda tick, w=writer: w.message.raw)
-            for writer in writers.values()
-        ]
-        outputs: Any = SimpleNamespace(writers=writers, ports=ports)
-        level: Any = SimpleNamespace()
-        self._replica = Replica(segment, wiring, outputs, level, AlarmWriter(segment, copy))
         self.writers = tuple(writers.values())
+        spec = segment.layout.find_task(copy)
+        self._right = WritingRight(segment, spec, self.writers, AlarmWriter(segment, copy))
         for writer in self.writers:
             mine(writer, bomb)
-        self._replica._group = MinedBox(self._replica._group, bomb)  # type: ignore[assignment]
-        self._replica._block = MinedBox(self._replica._block, bomb)  # type: ignore[assignment]
+        self._right.group = MinedBox(self._right.group, bomb)  # type: ignore[assignment]
+        self._right._block = MinedBox(self._right._block, bomb)  # type: ignore[assignment]
 
     def take_over(self) -> None:
         """Take over and publish."""
         # A process that is stopped while it takes over keeps others from doing so.
-        while not self._replica.take_over(self._number, HandOver.LOST):
+        while not self._right.take(self._number, HandOver.LOST):
             os.sched_yield()
         self._notes["has_claimed"] = 1
         self.publish(0)
 
     def publish(self, part: int) -> None:
         """Publish in all mailboxes, if this process believes that it may."""
-        if not self._replica.may_write(self._number):
+        if not self._right.permits_writing:
             return
         for box, writer in enumerate(self.writers):
             self._notes["epoch"][box] = get_epoch(writer.slots.signature)

@@ -34,7 +34,7 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Outages:
-    """What the faults of one campaign did to the output of their board.
+    """Effects of the faults of one campaign on the output of their board.
 
     Attributes:
         board: The board, "with standby" or without.
@@ -135,7 +135,7 @@ def build_comparison(
 
 
 def _summarize_outages(name: str, results: Results) -> Outages:
-    """Summarize what the faults of a campaign did to the output of their board."""
+    """Summarize the effects of a campaign's faults on the output of their board."""
     faults = [fault for fault in results.faults if fault.struck >= 0]
     outages = [ticks for run in results.trials for ticks in run.outages]
     return Outages(
