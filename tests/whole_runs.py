@@ -57,6 +57,7 @@ TIMELESS = ("tick", "flags", "state")
 def counted(segment: Segment) -> dict[str, object]:
     """Return the counts of the tasks and of the clock, and the cycles that the trace still has."""
     layout = segment.layout
+    lost = {task.slot for task in layout.tasks if segment.get_block(task.name)[Block.LOST]}
     cycles = {}
     for task in layout.tasks:
         rows = open_trace_ring(segment, task.name).read_new_rows().rows
@@ -67,7 +68,8 @@ def counted(segment: Segment) -> dict[str, object]:
             for task in layout.processes
         },
         "system": [segment.words[word] for word in OF_SYSTEM],
-        "sysfail": UtilityLines(segment).sysfail,
+        # The replacement of a lost task releases the line at no certain tick.
+        "sysfail": [slot for slot in UtilityLines(segment).sysfail if slot not in lost],
         "cycles": cycles,
     }
 

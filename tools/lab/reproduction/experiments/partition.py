@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -108,7 +107,17 @@ class PartitionFigures:
     off_path_rad: float
 
 
-def _run_partitions(name: str, seconds: float, workshop: Workshop) -> tuple[PartitionFigures, ...]:
+def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
+    """Run NASREM in every partition, as far as in `SECONDS`."""
+    return _run_partitions(workshop, NAME, SECONDS)
+
+
+def _measure_tasks(workshop: Workshop) -> tuple[PartitionFigures, ...]:
+    """Run a whole task in every partition."""
+    return _run_partitions(workshop, TASK, MAX_TASK_S)
+
+
+def _run_partitions(workshop: Workshop, name: str, seconds: float) -> tuple[PartitionFigures, ...]:
     """Run a rack in every partition, for at most `seconds`."""
     config = workshop.load_config(name)
     # Check all configs before the first rack runs.
@@ -126,7 +135,7 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
     tuple[PartitionFigures, ...],
-    partial(_run_partitions, NAME, SECONDS),
+    _measure_partitions,
     cores=2,
 )
 TASKS = Experiment(
@@ -134,7 +143,7 @@ TASKS = Experiment(
     "the same task with its planners on one core and on two",
     len(PARTITIONS) * (TASK_S + LAUNCH_S),
     tuple[PartitionFigures, ...],
-    partial(_run_partitions, TASK, MAX_TASK_S),
+    _measure_tasks,
     cores=2,
 )
 
