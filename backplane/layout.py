@@ -288,12 +288,12 @@ class Layout:
             and (
                 mailbox.readers
                 or mailbox.writer in tasks
-                or mailbox.name.partition(".")[0] not in self.replicated
+                or mailbox.name.partition(".")[0] not in self.replicated_tasks
             )
         )
 
     @property
-    def replicated(self) -> tuple[str, ...]:
+    def replicated_tasks(self) -> tuple[str, ...]:
         """Names of the tasks that have standbys."""
         return tuple(dict.fromkeys(t.board for t in self.tasks if t.role == "standby"))
 
@@ -304,7 +304,7 @@ class Layout:
         return (spec, *standbys)
 
     def find_first_copy(self, task: str) -> str:
-        """Return the name of the task of which a task is a standby, otherwise its own name."""
+        """Return the name of the task that a standby copies. For other tasks, return their own."""
         return next((s.board for s in self.tasks if (s.name, s.role) == (task, "standby")), task)
 
     def find_pacers(self, host: TaskSpec) -> set[str]:

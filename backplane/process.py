@@ -21,6 +21,8 @@ ENDED_STATES = "ZX"
 """States of a process that has ended."""
 WAITING_STATES = "SD"
 """States of a process that waits."""
+_EXITING = 0x4
+"""PF_EXITING of linux/sched.h, among the flags in /proc/<pid>/stat."""
 _TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
 STOPPED_STATES = "Tt"
 """States of a process stopped by a signal or a debugger."""
@@ -55,6 +57,15 @@ def _read_stat(pid: int) -> list[str]:
         return []
     # The command name, in parentheses, may contain spaces and parentheses.
     return stat.rpartition(")")[2].split()
+
+
+def is_ending(pid: int) -> bool:
+    """Check whether a process has ended or runs no more code of its own, because it is being freed.
+
+    A killed process with much memory remains in state R until its memory is free, for 10 ms or so.
+    """
+    fields = _read_stat(pid)
+    return not fields or fields[0] in ENDED_STATES or bool(int(fields[6]) & _EXITING)
 
 
 def is_alive(pid: int) -> bool:

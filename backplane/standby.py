@@ -18,7 +18,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from rack.backplane.address_map import CLOCK, CLOCK_STANDBY
 from rack.backplane.checked import to_enum
+from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, HandOver
 
@@ -86,9 +88,14 @@ class ReplicatedTask:
         return next((copy for copy in self.copies if copy.is_active), self.copies[0])
 
 
+def find_original(layout: Layout, copy: str) -> str:
+    """Return the name of the task, or of the clock, that a process copies. It may be its own."""
+    return CLOCK if copy == CLOCK_STANDBY else layout.find_first_copy(copy)
+
+
 def list_standbys(segment: Segment) -> tuple[ReplicatedTask, ...]:
     """Return all tasks that have standbys, with the state of each copy."""
-    return tuple(_read_task(segment, board) for board in segment.layout.replicated)
+    return tuple(_read_task(segment, board) for board in segment.layout.replicated_tasks)
 
 
 def _read_task(segment: Segment, name: str) -> ReplicatedTask:

@@ -13,6 +13,9 @@ from rack.boards.config.timing import NS_PER_MS, build_rack_timing
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.timing.joined import JoinedRacks, RackLink, Station
 
+COMMAND_FIELDS = {(field.name, field.meaning) for field in Command.message_type.fields}
+"""Names and meanings of the fields that every command has."""
+
 
 def load_partners(config: RackConfig) -> list[RackConfig]:
     """Load the configs of racks that a config launches or names as partners.
@@ -74,8 +77,7 @@ def _list_links(
                 rack=name,
                 port=port,
                 readers=box.readers,
-                # Every command begins with the field of its base class.
-                is_command=box.fields[0].meaning == Command.message_type.fields[0].meaning,
+                is_command={(field.name, field.meaning) for field in box.fields} >= COMMAND_FIELDS,
                 exported=_compute_grid(layouts[entry.rack], exported[entry.mailbox].rate_hz),
                 imported=_compute_grid(layout, entry.rate_hz),
                 adapter_ns=layout.find_task(LAN).every * layout.clock_ns,

@@ -89,8 +89,19 @@ def build_clock_scheduling(config: RackConfig) -> dict[str, Scheduling]:
         return {}
     clock = config.clock
     switch_ns = round(2 * config.timing.context_switch_ms * NS_PER_MS)
-    place = clock.core, clock.priority, find_clock_scheduler(config)
-    return {CLOCK: Scheduling(*place, True, cost_ns, switch_ns, 0, 0, None, None)}
+    scheduling = Scheduling(
+        clock.core,
+        clock.priority,
+        find_clock_scheduler(config),
+        is_critical=True,
+        cost_ns=cost_ns,
+        switch_ns=switch_ns,
+        locked_ns=0,
+        ceiling=0,
+        reservation=None,
+        clocks=None,
+    )
+    return {CLOCK: scheduling}
 
 
 def compute_clock_reservation(config: RackConfig) -> Reservation | None:

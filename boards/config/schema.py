@@ -20,6 +20,13 @@ from rack.boards.config.command import CommandConfig
 from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
+from rack.boards.config.times import (
+    SHORTEST_MS,
+    BudgetConfig,
+    ScheduleConfig,
+    TimingConfig,
+    TransferConfig,
+)
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -59,9 +66,6 @@ Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
-Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
-SHORTEST_MS = 0.01
-"""Shortest tick, in real time and in simulated time."""
 FORMAT = 2
 """Newest format of configs, used since rack 0.2."""
 FORMAT_NOTE = (
@@ -125,67 +129,6 @@ class ClockConfig(Table):
     """SCHED_FIFO priority of the system controller; 0 means ordinary scheduling"""
     standby: StandbyConfig | None = None
     """further process that continues the clock when the first one is lost"""
-
-
-class TimingConfig(Table):
-    """`[timing]`: assumptions of the timing model about the processors."""
-
-    context_switch_ms: Milliseconds = 0.1
-    """time of one context switch (t_cs) [ms]; the paper takes 0.1"""
-    response_ms: float | None = Field(None, ge=SHORTEST_MS, le=1e9)
-    """goal for the response time R_s of the system (eqs 3.2, 3.3) [ms]; simulated time; R_max is
-    R_s / n"""
-    clock_ms: Milliseconds = 0.0
-    """processor time that the system clock's board needs per tick [ms]"""
-    lockstep_load: float = Field(0.0, ge=0, le=1000)
-    """in lockstep, each cycle and plan takes this multiple of its budget as simulated time, and two
-    context switches, on cores under the boards' schedulers, which the config must name; with 0
-    computing takes no simulated time"""
-    small_share: float = Field(0.1, gt=0, le=1)
-    """largest fraction of a cycle that counts as much smaller than the cycle (eq. 3.10)"""
-
-
-class ScheduleConfig(Table):
-    """`[schedule]`: static cyclic schedule of all boards; see `rack.boards.timing.frames`."""
-
-    minor_ms: Positive
-    """minor frame [ms]; a whole number of ticks that divides every board's cycle"""
-    major_ms: Positive
-    """major frame [ms]; a multiple of the minor frame and of every board's cycle"""
-
-
-class BudgetConfig(Table):
-    """`[board.<name>.budget]`: worst-case processor times of the level, for the timing model."""
-
-    read_ms: Milliseconds = 0.0
-    """R: read commands and statuses, per cycle [ms]"""
-    process_ms: Milliseconds = 0.0
-    """X: process, per cycle [ms]"""
-    write_ms: Milliseconds = 0.0
-    """W: write commands and statuses, per cycle [ms]"""
-    exchange_ms: Milliseconds = 0.0
-    """C: read the plan, per cycle [ms]"""
-    plan_ms: Milliseconds = 0.0
-    """P: plan, per plan [ms]"""
-    update_ms: Milliseconds = 0.0
-    """U: write the plan, per plan [ms]"""
-    plan_within_ms: float | None = Field(None, gt=0, le=1e7)
-    """longest acceptable time for a new plan [ms]; limits within_cycles"""
-    send_within_ms: float | None = Field(None, gt=0, le=1e7)
-    """interrupts are sent this long after a release [ms]; default: the worst-case response"""
-
-
-class TransferConfig(Table):
-    """`[board.<name>.transfer]`: least processor times of bus accesses, to emulate a slower bus."""
-
-    read_ms: Milliseconds = 0.0
-    """R: the executor reads commands and statuses, per cycle [ms]"""
-    write_ms: Milliseconds = 0.0
-    """W: the executor writes commands and statuses, per cycle [ms]"""
-    exchange_ms: Milliseconds = 0.0
-    """C: the executor reads the plan, per cycle [ms]"""
-    update_ms: Milliseconds = 0.0
-    """U: the planner writes its plan [ms]"""
 
 
 class ExchangeConfig(Table):
@@ -536,6 +479,12 @@ class RackConfig(Table):
                     core,
                     board.planner_priority,
                 )
+
+    def list_free_slots(self) -> list[int]:
+        """Return the slots that no board has, in ascending order."""
+        taken = {task.slot for task in self.list_tasks()}
+        taken |= {standby.slot for _, standby in self.list_standby_tables()}
+        return [slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken]
 
     def list_standby_tables(self) -> Iterator[tuple[str, StandbyConfig]]:
         """Yield the table of each standby with its place, as in "board.servo.standby[1]"."""

@@ -11,10 +11,9 @@ from rack.backplane.mailbox.interrupt import get_interrupt_spec, list_sources
 from rack.boards.config.command import CommandConfig
 from rack.boards.config.schedulers import find_clock_scheduler, find_scheduler
 from rack.boards.config.schema import (
-    BudgetConfig,
     RackConfig,
-    ScheduleConfig,
 )
+from rack.boards.config.times import BudgetConfig, ScheduleConfig
 from rack.boards.faults.config import FaultConfig
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, StandbyPlace

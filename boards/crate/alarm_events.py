@@ -244,7 +244,7 @@ class AlarmReader:
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
         elif about == "finding":
-            level = owner.partition(".standby")[0]
+            level = self._layout.find_first_copy(owner)
             declared = self._levels[level].findings if level in self._levels else ()
             finding = select_item(declared, number, "finding")
             code = finding.name
@@ -326,7 +326,7 @@ class AlarmReader:
             case "geom":
                 return self._geom(number)
             case "name":
-                level = owner.partition(".standby")[0]
+                level = self._layout.find_first_copy(owner)
                 names = self._levels[level].names if level in self._levels else ()
                 return select_item(names, number, "name")
             case "brakes" if number > 0:

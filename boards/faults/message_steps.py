@@ -164,7 +164,7 @@ class Corrupt(MessageStep):
 
 
 def choose_wrong_bit(entry: FaultEntry, spec: MailboxSpec) -> tuple[FieldSpec, int]:
-    """Return the field in which messages of a mailbox are wrong, and its bit to flip.
+    """Return the wrong field of a mailbox's messages, and the bit of it to flip.
 
     Both are drawn from the seed of the fault unless its parameters state them.
     """

@@ -41,7 +41,7 @@ class HandOverDirector:
             board: Copies(
                 segment.get_block(board), [tasks[copy.name] for copy in layout.list_copies(board)]
             )
-            for board in layout.replicated
+            for board in layout.replicated_tasks
         }
 
     def check_active_copies(self) -> None:

@@ -1,8 +1,8 @@
 """One copy of a task with standbys: holds its messages back, compares them, and takes over.
 
 All copies cycle alike, and the active copy writes. Before each cycle, every other copy compares the
-messages that it held back in its last cycle with those that the active copy has written in that
-cycle. If any differ, or the active copy has missed the cycle, the copy continues from the active
+messages of its last cycle, which it has held back, with the messages of the active copy. If any
+differ, or the active copy has missed the cycle, the copy continues from the active
 copy's message on port `state` (`Executor.realign`), until all messages are equal again.
 
 The clock requests a hand-over once the active copy is lost (`rack.boards.run.hand_over`). In
@@ -25,7 +25,7 @@ from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.checked import to_enum
 from rack.backplane.mailbox.protocols import open_standby_writer
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
+from rack.backplane.process import STOPPED_STATES, is_ending, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Box, HandOver, Run, Slot, System
@@ -36,7 +36,7 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor
 
 STATE_SUFFIX = ".state"
-"""End of the name of the mailbox with the state from which a standby continues."""
+"""End of the name of a mailbox that contains the state of a level for its standbys."""
 MAX_AHEAD = 3
 """Largest number of messages that the active copy may have written since the compared cycle."""
 
@@ -48,12 +48,12 @@ class ReplicatedOutputs(OutputPorts):
 
 
 class ReplicatedOutput:
-    """One output of a copy: the message that it holds back, and those of the active copy.
+    """One output of a copy: its own message, and the message of the active copy.
 
     Attributes:
         spec: The mailbox.
         slots: Slots of the mailbox.
-        held: The message that this copy has held back in its last cycle.
+        held: Message of the last cycle, which this copy has held back.
     """
 
     def __init__(self, segment: Segment, port: OutputPort) -> None:
@@ -85,7 +85,7 @@ class ReplicatedOutput:
         return self.slots.record[SLOT_HEAD_SIZE:]
 
     def find_difference(self) -> str:
-        """Return the first field in which the fetched message differs from the one held back."""
+        """Return the name of the first field whose value in the fetched message is another one."""
         fields = self.spec.fields
         ends = (*(field.offset for field in fields[1:]), self.spec.size)
         return next(
@@ -139,7 +139,7 @@ class ReplicatedLoop(VirtualControlLoop):
         self.next_cycle.serve_request = self.serve_request
         self.block[Block.ALIGNED] = 0
         if self._is_first and self.right.number == 0:
-            self.right.take(0, HandOver.NONE)
+            self.right.take_over(0, HandOver.NONE)
 
     def serve_request(self) -> None:
         """Take over if the clock requests it from this copy. Called between two cycles."""
@@ -148,7 +148,7 @@ class ReplicatedLoop(VirtualControlLoop):
             return
         if not self.right.is_held:
             tick = self.words[System.TICK]
-            if not self.right.take(tick, to_enum(HandOver, group[Block.TAKE_OVER_REASON])):
+            if not self.right.take_over(tick, to_enum(HandOver, group[Block.TAKE_OVER_REASON])):
                 return
             if self._held_tick is not None:
                 now = None if self.clock.is_lockstep else tick
@@ -161,7 +161,7 @@ class ReplicatedLoop(VirtualControlLoop):
         """Run the cycle released at `tick`."""
         self.serve_request()
         if self.right.is_held:
-            self.right.keep(tick)
+            self.right.keep_claims(tick)
         else:
             self._follow_active_copy(tick)
         super().cycle(tick)
@@ -171,14 +171,14 @@ class ReplicatedLoop(VirtualControlLoop):
 
         In real time, take over instead if the active copy is lost or late.
         """
-        self.right.release()
+        self.right.release_claims()
         held = tick - self.spec.every
         if self._held_tick != held:
             self.block[Block.ALIGNED] = 0
-            self._realign(held)
+            self._realign_level(held)
             return
         if not self.clock.is_lockstep and (reason := self._find_loss(held)):
-            self.right.take(tick, reason)
+            self.right.take_over(tick, reason)
             return
         late = sum(block[Block.MISSED] + block[Block.SKIPPED] for block in self._blocks)
         if late != self._late:
@@ -196,10 +196,10 @@ class ReplicatedLoop(VirtualControlLoop):
         active = self._blocks[self._group[Block.ACTIVE]]
         if active[Block.DONE] >= held and not active[Block.LOST]:
             return HandOver.NONE
-        state = read_state(active[Block.PID])
-        if active[Block.LOST] or state in ENDED_STATES:
+        pid = active[Block.PID]
+        if active[Block.LOST] or is_ending(pid):
             return HandOver.LOST
-        if state in STOPPED_STATES:
+        if read_state(pid) in STOPPED_STATES:
             return HandOver.STOPPED
         # A copy that was late itself, or that does not have the state of the active one, is no
         # better than a copy that is merely late.
@@ -207,7 +207,7 @@ class ReplicatedLoop(VirtualControlLoop):
         return HandOver.NONE if is_late or not self.block[Block.ALIGNED] else HandOver.LATE
 
     def _compare_messages(self, tick: int, held: int) -> None:
-        """Compare the messages held back in the last cycle with those of the active copy.
+        """Compare the messages of the last cycle with the messages of the active copy.
 
         Args:
             tick: Release tick of this cycle.
@@ -234,7 +234,7 @@ class ReplicatedLoop(VirtualControlLoop):
         block[Block.ALIGNED] = 0
         if stray != self._group[Block.ACTIVE]:
             # Otherwise the state of the active copy is of no use.
-            self._realign(held)
+            self._realign_level(held)
 
     def _find_stray(self, tick: int, due: Sequence[ReplicatedOutput]) -> int | None:
         """Return the number of the copy that has strayed in a cycle. None if there is no majority.
@@ -257,7 +257,7 @@ class ReplicatedLoop(VirtualControlLoop):
         """Return the word for the vote in a cycle. Successive cycles have different words."""
         return Block.VOTE + tick // self.spec.every % 2
 
-    def _realign(self, tick: int) -> None:
+    def _realign_level(self, tick: int) -> None:
         """Let the level continue from the state that the active copy has written at `tick`."""
         for output in self._outputs:
             if output.spec.name.endswith(STATE_SUFFIX) and output.fetch_message(tick):

@@ -77,7 +77,7 @@ class SystemController:
                 segment, driver.tasks, wiring.schedulings, driver.alarms
             )
         self._hand_overs: HandOverDirector | None = None
-        if segment.layout.replicated:
+        if segment.layout.replicated_tasks:
             # Import it only in racks that have standbys.
             self._hand_overs = import_module(HAND_OVER).HandOverDirector(segment, driver)
             self._desk.hand_overs = self._hand_overs

@@ -50,11 +50,11 @@ class WritingRight:
         """True if this copy is the active one and has claimed all mailboxes."""
         return self.is_held and all(writer.claim.is_valid for writer in self._writers)
 
-    def take(self, tick: int, reason: HandOver) -> bool:
+    def take_over(self, tick: int, reason: HandOver) -> bool:
         """Claim the mailboxes, and become the active copy.
 
         Args:
-            tick: Tick from which this copy writes.
+            tick: First tick in which this copy writes.
             reason: Reason for the hand-over.
 
         Returns:
@@ -81,16 +81,16 @@ class WritingRight:
             self._lock.release()
         return self.is_held
 
-    def keep(self, tick: int) -> None:
+    def keep_claims(self, tick: int) -> None:
         """Claim the mailboxes if this is a new process or a standby has died while taking over."""
         if self.permits_writing:
             for writer in self._writers:
                 writer.claim.try_lock()
         elif not self.group[Block.TAKE_OVER]:
             # Otherwise the clock has asked another copy to take over from an earlier process.
-            self.take(tick, HandOver.LOST)
+            self.take_over(tick, HandOver.LOST)
 
-    def release(self) -> None:
+    def release_claims(self) -> None:
         """Release claims that another copy has taken over while this one was late or stopped."""
         for writer in self._writers:
             if writer.claim.is_taken:

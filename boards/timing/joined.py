@@ -179,7 +179,7 @@ class JoinedRacks:
 
         Args:
             rack: Return only paths that end in this rack.
-            is_whole: Whether the runs of all racks measure it, not only that of the last one.
+            is_whole: Whether recordings of all racks are at hand, instead of the last one alone.
         """
         paths = [
             self._build_path(direction, stations, is_whole)

@@ -23,9 +23,9 @@ class CoreJob:
         ready_at: Time in ns from which the job can run.
         deadline_ns: Deadline of the job.
         left_ns: Processor time that the job still needs. 0 when it has ended.
-        locked_ns: Processor time at the end of the job in which its priority is the ceiling.
-        ceiling: Priority of this part.
-        turn_at: Time from which a job under ordinary scheduling waits for its turn.
+        locked_ns: Length of the last part of the job, which runs at priority `ceiling`.
+        ceiling: Priority of that part.
+        turn_at: Under ordinary scheduling, time at which the job began to wait for its turn.
         turn_ns: Rest of that turn.
         begun_ns: Time at which the job began. -1 if it has not.
     """

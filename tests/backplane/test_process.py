@@ -25,6 +25,7 @@ from rack.backplane.process import (
     die_with_parent,
     disable_timer_slack,
     is_alive,
+    is_ending,
     keep_cores_awake,
     list_children,
     name_process,
@@ -45,6 +46,26 @@ def test_a_running_process_is_alive() -> None:
     assert is_alive(os.getpid())
     assert not is_alive(0)
     assert not is_alive(-1)
+
+
+def test_a_killed_process_is_ending_before_it_has_ended() -> None:
+    """It first frees its memory, and is in state R meanwhile."""
+
+    def fill() -> None:
+        memory = bytearray(b"x") * 400_000_000
+        time.sleep(60)
+        assert memory
+
+    with forked(fill) as pid:
+        wait_until(lambda: read_memory_sizes(pid)[0] > 400_000_000)
+        assert not is_ending(pid)
+        os.kill(pid, signal.SIGKILL)
+        before = []
+        while not is_ending(pid):
+            before.append(read_state(pid))
+        assert not set(before) & set(ENDED_STATES)
+        wait_until(lambda: read_state(pid) in ENDED_STATES)
+        assert is_ending(pid)
 
 
 def test_a_process_name_may_contain_parentheses_and_spaces() -> None:

@@ -1,8 +1,9 @@
 """A node of ROS 2 over CycloneDDS, with the topics, types and QoS of rmw_cyclonedds.
 
 A topic is named `rt/TOPIC`; a service is the topics `rq/SERVICERequest` and `rr/SERVICEReply`,
-whose messages begin with the identity of the request. Types are built from those of rosbags, so
-that DDS can compare them with the types of other programs. Messages pass through as bytes.
+whose messages begin with the identity of the request. Types are built from the definitions in
+rosbags, so that DDS can compare them with the types of other programs. Messages pass
+through as bytes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ QOS = (
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 IDENTITY = {"guid": types.uint64, "seq": types.int64}
-"""Fields before those of a request or reply."""
+"""Fields that precede the content of a request or reply."""
 
 
 class DdsNode(RosNode):
@@ -50,14 +51,14 @@ class DdsNode(RosNode):
         except DDSException:
             raise Failure("CycloneDDS found no network, or CYCLONEDDS_URI is wrong") from None
 
-    def _create(self, create: Any, topic: str, kind: str, digest: str = "") -> Any:
+    def _create_endpoint(self, create: Any, topic: str, kind: str, digest: str = "") -> Any:
         """Create a writer or reader of a topic. Messages have a type hash as `digest`."""
         qos = Qos(*QOS, Policy.Userdata(f"{HASH_KEY}{digest};".encode() if digest else b""))
         return create(self._participant, Topic(self._participant, topic, build_type(kind)), qos=qos)
 
     def advertise(self, topic: str, kind: str) -> Publisher:
         """Publish on a topic."""
-        writer = self._create(DataWriter, f"rt{topic}", kind, STORE.hash_rihs01(kind))
+        writer = self._create_endpoint(DataWriter, f"rt{topic}", kind, STORE.hash_rihs01(kind))
         return Publisher(
             lambda: bool(writer.matched_sub), lambda message: _write(writer, bytes(message.data))
         )
@@ -65,7 +66,7 @@ class DdsNode(RosNode):
     def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None]) -> None:
         """Pass the newest message of a topic to `take`."""
         digest = STORE.hash_rihs01(kind)
-        reader = self._create(DataReader, f"rt{topic}", kind, digest)
+        reader = self._create_endpoint(DataReader, f"rt{topic}", kind, digest)
         wire_type = build_type(kind).__idl_typename__
         # DDS connects nobody who publishes another type, so nothing would be seen of it.
         graph: Any = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
@@ -87,8 +88,8 @@ class DdsNode(RosNode):
     def serve(self, answer: Callable[[], bytes]) -> None:
         """Answer the requests to the service."""
         trigger = "std_srvs/srv/Trigger"
-        reader = self._create(DataReader, f"rq{STOP_SERVICE}Request", f"{trigger}_Request")
-        writer = self._create(DataWriter, f"rr{STOP_SERVICE}Reply", f"{trigger}_Response")
+        reader = self._create_endpoint(DataReader, f"rq{STOP_SERVICE}Request", f"{trigger}_Request")
+        writer = self._create_endpoint(DataWriter, f"rr{STOP_SERVICE}Reply", f"{trigger}_Response")
 
         def reply_all() -> None:
             for request in _take(reader):

@@ -6,7 +6,6 @@ import time
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,8 +50,8 @@ class TopicBridge(RackBridge):
                 self.publishers[source.topic.name] = self.advertise(*source.topic)
             self._sources[source.ring].append(source)
         self.rings = tuple(self._sources)
-        folder = find_run_folder(segment) or Path("/dev/null")
-        self._events = EventFile(folder / "events.jsonl")
+        folder = find_run_folder(segment)
+        self._events = None if folder is None else EventFile(folder / "events.jsonl")
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
         self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
 
@@ -65,7 +64,7 @@ class TopicBridge(RackBridge):
         if ring in self._cycles:
             self._cycles[ring].append(rows)
         else:
-            self._send(self._sources[ring], rows[-1:])
+            self._send_rows(self._sources[ring], rows[-1:])
 
     def advance(self, tick: int) -> None:
         """Send the diagnostics of completed seconds, and the events of a recorded run."""
@@ -75,11 +74,12 @@ class TopicBridge(RackBridge):
                 rows = np.concatenate(blocks)
                 is_due = rows["tick"] < complete
                 blocks[:] = [] if is_due.all() else [rows[~is_due]]
-                self._send(self._sources[ring], rows[is_due])
-        # The first reader gets the events since the start of the run.
-        self._send([self.encoder.log], map(vars, self._events.read_new_events()))
+                self._send_rows(self._sources[ring], rows[is_due])
+        if self._events is not None:
+            # The first reader gets the events since the start of the run.
+            self._send_rows([self.encoder.log], map(vars, self._events.read_new_events()))
 
-    def _send(self, sources: Iterable[RosSource], rows: Any) -> None:
+    def _send_rows(self, sources: Iterable[RosSource], rows: Any) -> None:
         """Encode and send what rows or events become, unless nobody receives it."""
         for source in sources:
             publisher = self.publishers[source.topic.name]

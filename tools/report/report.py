@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.standby import find_original
 from rack.boards.config import RackConfig, resolve_layout
 from rack.boards.exchange import AGE_SUFFIX, EXCHANGE_PORT
 from rack.boards.timing.trace_times import (
@@ -138,16 +139,18 @@ def build_report(recording: Recording) -> Document:
 def summarize_standbys(recording: Recording) -> list[Document]:
     """Return the active copy of each task with standbys at the end, since when, and why."""
     since: Document = {"since_tick": 0, "since_s": 0.0, "why": "", "hand_overs": 0}
-    found = {task: {"task": task, "active": task, **since} for task in recording.layout.replicated}
+    layout = recording.layout
+    found = {task: {"task": task, "active": task, **since} for task in layout.replicated_tasks}
     # A run that continues another one also has hand-overs of that one.
     for event in (*recording.end_counts.get("earlier", ()), *recording.events):
         if event.get("code") == "taken_over":
-            task = event["subject"].partition(".")[0]
+            copy = event["subject"]
+            task = find_original(layout, copy)
             found[task] = {
                 "task": task,
-                "active": event["subject"],
+                "active": copy,
                 "since_tick": event["tick"],
-                "since_s": event["tick"] * recording.layout.clock_ns * 1e-9,
+                "since_s": event["tick"] * layout.clock_ns * 1e-9,
                 "why": event["text"].partition(": ")[2],
                 "hand_overs": found.get(task, since)["hand_overs"] + 1,
             }

@@ -111,7 +111,7 @@ def _complete_messages(
         origins = find_origins(other, path.before, partial(_complete_messages, runs))
         # The first messages depend on no message of the farther rack.
         is_known = np.isin(arrived, origins.basis)
-        messages, sent = messages.select(is_known), sent[is_known]
+        messages, sent = messages.select_messages(is_known), sent[is_known]
         at = np.searchsorted(origins.basis, sent["basis"])
         messages = messages._replace(gaps=messages.gaps + origins.gaps[at])
         arrived = origins.arrived[at]
@@ -152,7 +152,7 @@ def _match_messages(
     assert entries is not None, "it has imports"
     sent = other.read_rows(entries.imports[port].partition("/")[2])
     got = recording.read_rows(f"{ADAPTER}.{port}")
-    messages = messages.select(np.isin(messages.serials, sent["serial"]))
+    messages = messages.select_messages(np.isin(messages.serials, sent["serial"]))
     sent = sent[np.searchsorted(sent["serial"], messages.serials)]
     # A fault may keep a message that was taken from the mailbox.
     both = np.isin(messages.taken, got["tick"])

@@ -68,7 +68,7 @@ class ImportedMessages(NamedTuple):
     uncertainty_ms: float = 0.0
     list_delays: Callable[[int, int], Iterator[str]] = lambda _previous, _at: iter(())
 
-    def select(self, which: np.ndarray) -> ImportedMessages:
+    def select_messages(self, which: np.ndarray) -> ImportedMessages:
         """Return the messages for which `which` is True, as this rack knew them."""
         gaps = self.gaps + np.cumsum(~which)
         return ImportedMessages(*(column[which] for column in (*self[:6], gaps)))

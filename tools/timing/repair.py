@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
+from rack.boards.config.schema import LONGEST_EVERY
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
@@ -192,10 +192,7 @@ def _list_loose_couplings(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings that couple the board's planner loosely, one for each core it could use."""
     slot = rack.config.board[board].planner_slot
     if slot is None:
-        config = rack.config
-        taken = {place.slot for place in (*config.list_tasks(), *config.list_standbys())}
-        free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
-        slot = next(free, None)
+        slot = next(iter(rack.config.list_free_slots()), None)
     if rack.timing.build_level(board).within_cycles is not None and slot is not None:
         for core in _list_other_cores(rack, rack.timing.boards[board].planner_core):
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": core}

@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from rack.backplane.layout import Layout
+from rack.backplane.standby import find_original
 from rack.boards.events import Event
 from rack.tools.recording.current_run import EventFile
 from rack.tools.viewer.cell import MarkWriter
@@ -43,6 +45,7 @@ class EventWriter:
     Args:
         stream: Stream to write to.
         path: Path of events.jsonl.
+        layout: Layout of the rack.
         names: Dictionary from task to its name in lanes.
         mark_lost: Function that shows the loss of a task, given when it was noticed.
         marks: Writer of marks in 3D, or None without an arm.
@@ -52,12 +55,14 @@ class EventWriter:
         self,
         stream: Stream,
         path: Path,
+        layout: Layout,
         names: Mapping[str, str],
         mark_lost: Callable[[Moment, str], None],
         marks: MarkWriter | None,
     ) -> None:
         self._stream = stream
         self._file = EventFile(path)
+        self._layout = layout
         self._names = names
         self._mark_lost = mark_lost
         self._lost: set[str] = set()
@@ -86,7 +91,7 @@ class EventWriter:
         if event.kind not in KINDS_WITHOUT_LANE:
             self._write_lane(when, board, event)
         if event.code in ("active", "taken_over"):
-            task = event.subject.partition(".")[0]
+            task = find_original(self._layout, event.subject)
             lane = (EVENTS, self._names.get(task, task), "active")
             write_span(self._stream, when, lane, event.subject)
         if self._marks is not None:

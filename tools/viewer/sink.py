@@ -190,7 +190,7 @@ class RackWriter:
             if marks is not None:
                 marks.mark_lost(when, task)
 
-        self._events = EventWriter(stream, ran.events, names, mark_lost, marks)
+        self._events = EventWriter(stream, ran.events, layout, names, mark_lost, marks)
         self._write_losses = build_loss_lines(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 

@@ -57,7 +57,9 @@ class CycleLane:
         self, stream: Stream, task: TaskSpec, board: str, speed: float, lockstep: bool
     ) -> None:
         self._stream = stream
-        self._lane = (BOARDS, board, task.name.partition(".")[2] or task.role)
+        is_standby = task.role == "standby"
+        lane = task.name.removeprefix(f"{task.board}.") if is_standby else task.role
+        self._lane = (BOARDS, board, lane)
         self._every = task.every
         self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
         self._work = "plan" if task.role == "planner" else "process"

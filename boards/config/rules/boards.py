@@ -24,10 +24,9 @@ from rack.boards.config.schedulers import (
 from rack.boards.config.schema import (
     LAN,
     LONGEST_EVERY,
-    SHORTEST_MS,
     BoardConfig,
-    ScheduleConfig,
 )
+from rack.boards.config.times import SHORTEST_MS, ScheduleConfig
 from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
 from rack.boards.errors import Mistake, Mistakes
 

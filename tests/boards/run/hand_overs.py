@@ -132,7 +132,7 @@ class Round:
     def take_over(self) -> None:
         """Take over and publish."""
         # A process that is stopped while it takes over keeps others from doing so.
-        while not self._right.take(self._number, HandOver.LOST):
+        while not self._right.take_over(self._number, HandOver.LOST):
             os.sched_yield()
         self._notes["has_claimed"] = 1
         self.publish(0)

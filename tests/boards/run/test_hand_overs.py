@@ -18,8 +18,8 @@ MUTANT_ROUNDS = 500
 LIMIT_S = 4 * 3600.0 if EXHAUSTIVE else 4 * BOUND_S
 WRONG = ("torn", "missing", "double")
 MAX_STALE = 1e-3
-"""Share of rounds in which the message of a replaced process may be read all the same. One in
-30,000 was, and it is not known yet why: perhaps it was published before the claim."""
+"""Largest fraction of rounds in which a reader may get the message of a replaced process. Two in
+330,000 did, and it is not known why. Perhaps this test misjudges a message that was published."""
 
 
 def hand_over(rack: str, rounds: int, cripple: str = "") -> Mapping[str, int]:

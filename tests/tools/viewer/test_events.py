@@ -35,6 +35,7 @@ def write_log(
     writer = EventWriter(
         stream,
         folder / "events.jsonl",
+        layout,
         {"servo": "1-servo"},
         lambda when, task: lost.append((when.tick, task)),
         None,

@@ -90,5 +90,5 @@ class BaseRack:
         return self._trial
 
     def _continue_before(self, tick: int) -> Continuation:
-        """Return the point from which a rack continues: the last snapshot up to a tick."""
+        """Request to continue from the last snapshot at or before a tick."""
         return Continuation(tick, len(self._config.fault), len(self._config.command))

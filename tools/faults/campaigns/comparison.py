@@ -44,7 +44,7 @@ class Outages:
         max_ticks: Longest such time.
         braked: Number of faults after which brakes engaged.
         missed: Number of messages missing in the mailboxes of the board, in all trials.
-        recovered: Number of faults from which the rack recovered.
+        recovered: Number of faults after which the rack recovered.
     """
 
     board: str
@@ -60,22 +60,23 @@ def list_standby_settings(config: RackConfig, board: str) -> tuple[str, ...]:
     """Return the settings that give a board a standby. None are needed if it has one.
 
     Raises:
-        Failure: There is no such board.
+        Failure: There is no such board, or no free slot.
     """
     if board not in config.board:
         names = ", ".join(config.board)
         raise Failure(f"--standby {board}: there is no such board; boards: {names}", 2)
     if config.board[board].standby:
         return ()
-    used = {place.slot for place in (*config.list_tasks(), *config.list_standbys())}
-    slot = max({*range(2, 22)} - used, default=21)
+    free = config.list_free_slots()
+    if not free:
+        raise Failure(f"--standby {board}: all slots are taken; free one for the standby", 2)
     cores = sorted(os.sched_getaffinity(0))
     core = next((core for core in cores if core != config.board[board].core), cores[0])
-    return (f"board.{board}.standby={{slot={slot},core={core}}}",)
+    return (f"board.{board}.standby={{slot={free[-1]},core={core}}}",)
 
 
 def remove_standby(config: RackConfig, board: str) -> RackConfig:
-    """Return a copy of a config in which a board has no standby."""
+    """Return a config without the standbys of a board."""
     alone = config.board[board].model_copy(update={"standby": (), "compare": False, "vote": False})
     return config.model_copy(update={"board": {**config.board, board: alone}})
 

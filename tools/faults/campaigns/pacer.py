@@ -62,12 +62,12 @@ class Pacer:
         self._hold_before(max(faults[0]["tick"], rack.begins_at))
 
     @property
-    def begins(self) -> tuple[int, ...]:
+    def begin_ticks(self) -> tuple[int, ...]:
         """Tick at which each fault began or is due."""
         return tuple(entry.tick for entry in self._entries)
 
     def continue_if_held(self) -> None:
-        """If the rack is held, begin the next fault or end the trial if it is time, and go on."""
+        """If the rack is held, begin the next fault or end the trial, and continue."""
         words = self._words
         # The clock may not have noticed yet that it may continue.
         if not 0 < words[System.HOLD_AT] <= words[System.HELD]:
@@ -112,14 +112,14 @@ class Pacer:
         """
         planned = waiting[0].tick
         if planned > tick:
-            begin = tick + judge.settle_ticks
+            begin = tick + judge.quiet_ticks
             if not any(block[Block.LOST] for block in self._tasks):
                 settled = judge.find_settled_tick(tick)
                 begin = max([settled, *self._list_limits(waiting[0].index)])
             if begin > tick:
                 return min(begin, planned)
             self._table.advance_waiting(planned - tick)
-        return tick + judge.settle_ticks
+        return tick + judge.quiet_ticks
 
     def _list_limits(self, index: int) -> Iterator[int]:
         """Yield the ticks before which a fault must not begin.
@@ -151,12 +151,12 @@ class ForesightedJudge(Judge):
     """Evaluates faults and also computes when they are settled and when judgements are final."""
 
     @property
-    def settle_ticks(self) -> int:
+    def quiet_ticks(self) -> int:
         """Number of ticks without reports after which a fault is settled."""
         return round(SETTLE_S * 1e9 / self._layout.clock_ns)
 
     def find_certain_tick(self, tick: int) -> int | None:
-        """Return the tick from which no later event can change a judgement.
+        """Return the first tick at which all judgements are final, whatever happens later.
 
         Args:
             tick: Tick before which the rack is held.
@@ -174,7 +174,7 @@ class ForesightedJudge(Judge):
         return latest
 
     def find_settled_tick(self, tick: int) -> int:
-        """Return the tick from which the only fault of this judge is settled.
+        """Return the first tick at which the fault of this judge is settled. It must have only one.
 
         A fault is settled if it is over, was detected within its bound, has all reactions that it
         requires, is recovered from, and nothing has been reported for `SETTLE_S` since.
@@ -194,15 +194,15 @@ class ForesightedJudge(Judge):
                 for event in self._events
                 if event.kind in REPORTS and event.code not in ASYNCHRONOUS
             ]
-            return max(ends, *reported) + self.settle_ticks
+            return max(ends, *reported) + self.quiet_ticks
         if tick <= ends < NEVER:
-            return ends + self.settle_ticks
-        return tick + max(self.settle_ticks, (tick - strike.began) // PATIENCE)
+            return ends + self.quiet_ticks
+        return tick + max(self.quiet_ticks, (tick - strike.began) // PATIENCE)
 
     def _find_fault_certain_tick(
         self, strike: Strike, judgement: Judgement, tick: int
     ) -> int | None:
-        """Return the tick from which one judgement is final.
+        """Return the first tick at which one judgement is final.
 
         The result has the same meaning as that of `find_certain_tick`.
         """

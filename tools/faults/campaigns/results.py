@@ -104,7 +104,7 @@ def judge_trial(trial: Trial) -> TrialResult:
         if trial.run is not None
         else (),
         missing=trial.missing,
-        begins=trial.begins,
+        begins=trial.begin_ticks,
     )
 
 

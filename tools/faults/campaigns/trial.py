@@ -158,7 +158,7 @@ class Trial:
         levels: Last state of each level, as text.
         is_late: Whether a level ended with an error because it could not meet a time.
         again: Outcome of a second run, without the faults, after a refused launch.
-        begins: Tick at which each fault of the plan began, or was due when the run ended.
+        begin_ticks: Tick at which each fault of the plan began, or was due when the run ended.
         start: Starting point of the trial.
         missing: Number of messages that the boards of its faults have not written.
         is_cut: Whether the trial was ended early because the verdict on each fault was certain.
@@ -176,7 +176,7 @@ class Trial:
     levels: str = ""
     is_late: bool = False
     again: Outcome | None = None
-    begins: tuple[int, ...] = ()
+    begin_ticks: tuple[int, ...] = ()
     start: Start = field(default_factory=Start)
     missing: int = 0
     is_cut: bool = False
@@ -239,7 +239,7 @@ def run_trial(
             boards = {find_board(strike.board) for strike in trial.strikes}
             trial.missing = count_missing_messages(rack.segment, boards)
             if pacer is not None:
-                trial.begins = pacer.begins
+                trial.begin_ticks = pacer.begin_ticks
             trial.arm = read_arm(rack.segment)
             trial.levels = format_levels(rack.segment)
             trial.is_late = is_late(rack.segment)

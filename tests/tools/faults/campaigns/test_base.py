@@ -154,7 +154,7 @@ def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
     )
     plan = Plan(1, "faults", True, (*faults, {"kind": "kill", "board": "upper", "tick": 1200}))
     trial = bench.run(plan)
-    begins = trial.begins
+    begins = trial.begin_ticks
     assert trial.is_cut
     # The third and fourth affect the mailboxes of the first two, so the times that are planned for
     # those have passed in between.
@@ -166,13 +166,13 @@ def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
     assert all(fault.seen == "detected" for fault in judge_trial(trial).faults)
     # Equal plans have equal trials.
     again = bench.run(plan)
-    assert (again.begins, again.outcome) == (begins, trial.outcome)
+    assert (again.begin_ticks, again.outcome) == (begins, trial.outcome)
     # A run with faults at these ticks is the same, and has the same verdicts.
     actual = judge_trial(trial).actual_plan
     assert [table["tick"] for table in actual.faults] == [*begins]
     whole = bench.run(actual, whole=True)
     assert {**verdict(trial), "plan": None} == {**verdict(whole), "plan": None}
-    assert (whole.begins, judge_trial(whole).actual_plan) == ((), actual)
+    assert (whole.begin_ticks, judge_trial(whole).actual_plan) == ((), actual)
 
 
 @pytest.mark.slow
