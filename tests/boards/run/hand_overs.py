@@ -41,7 +41,7 @@ from rack.backplane.words import Box, HandOver, Run, System
 from rack.boards.run.writing_right import WritingRight
 from tests.backplane.bus import layout, mailbox, task
 from tests.backplane.mailbox.mines import Bomb, MinedBox, mine
-from tests.processes import fork, forked
+from tests.processes import fork, forked, wait_until
 
 BOXES = ("writer.command", "writer.status")
 COPIES = ("writer", "writer.standby", "writer.standby2")
@@ -53,6 +53,7 @@ LIMIT_S = 60
 ROUND = np.dtype(
     [
         ("pid", "i8"),
+        ("tries", "i8"),  # to take over
         ("has_claimed", "i8"),
         ("epoch", "i8", len(BOXES)),  # in which it believed that it may write; 0: it did not
         ("has_published", "i8", len(BOXES)),
@@ -131,8 +132,10 @@ class Round:
 
     def take_over(self) -> None:
         """Take over and publish."""
+        self._notes["tries"] += 1
         # A process that is stopped while it takes over keeps others from doing so.
         while not self._right.take_over(self._number, HandOver.LOST):
+            self._notes["tries"] += 1
             os.sched_yield()
         self._notes["has_claimed"] = 1
         self.publish(0)
@@ -198,6 +201,12 @@ def read_on(segment: Segment, rounds: Any, counts: Any) -> None:
         time.sleep(PAUSE_S)
 
 
+def has_changed(pid: int) -> bool:
+    """Check whether a child has ended or stopped. It remains to be waited for."""
+    options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT
+    return os.waitid(os.P_PID, pid, options) is not None
+
+
 def share(dtype: np.dtype, count: int) -> Any:
     """Return an array that forked processes share."""
     return np.frombuffer(mmap.mmap(-1, dtype.itemsize * count), dtype, count)
@@ -246,6 +255,11 @@ class HandOvers:
             signal.alarm(0)
             self._end_stopped(before)
 
+    def _choose_store(self, number: int) -> int:
+        """Return the store before which a round ends. In random order, each has its turn."""
+        lap, place = divmod(number, self.stores + 1)
+        return Random(lap).sample(range(self.stores + 1), self.stores + 1)[place]
+
     def _run_round(self, number: int, before: int) -> int:
         """Run one round.
 
@@ -257,7 +271,7 @@ class HandOvers:
             This number if the process is stopped, otherwise 0.
         """
         rounds = self.rounds
-        store = number % (self.stores + 1)
+        store = self._choose_store(number)
         kind, is_soon = Random(number).choice(ENDS)
         # A process that is stopped in its claim must end before another one can take over.
         is_soon = is_soon or (before > 0 and not rounds["has_claimed"][before])
@@ -272,6 +286,8 @@ class HandOvers:
 
         pid = fork(work)
         if before and is_soon:
+            if not rounds["has_claimed"][before]:
+                wait_until(lambda: rounds["tries"][number] > 1 or has_changed(pid))
             os.kill(int(rounds["pid"][before]), signal.SIGCONT)
         _, status = os.waitpid(pid, os.WUNTRACED)
         is_stopped = os.WIFSTOPPED(status)
@@ -305,9 +321,10 @@ class HandOvers:
         assert status == 0, status
 
     def _read_now(self) -> None:
-        """Read everything as a board does, and as a recorder."""
+        """Read everything as a board does, as a board that has just started, and as a recorder."""
         for box, check in enumerate(self._checks):
             check.read()
+            ReadChecks(self._segment, box, self.rounds, self.counts[1]).read()
             # A stopped process may have set the head to what its successor has filled.
             self.rounds["has_published"][check.newest, box] = 1
         for ring, check in zip(self._rings, self._history, strict=True):

@@ -14,7 +14,7 @@ from tests.processes import BOUND_S
 
 pytestmark = pytest.mark.slow
 ROUNDS = 110_000 if EXHAUSTIVE else 330
-MUTANT_ROUNDS = 500
+MUTANT_ROUNDS = 1500
 LIMIT_S = 4 * 3600.0 if EXHAUSTIVE else 4 * BOUND_S
 WRONG = ("torn", "missing", "double")
 MAX_STALE = 1e-3

@@ -24,6 +24,7 @@ from rack.tools.commands.replay import replay
 from rack.tools.console import interrupt
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
+from rack.tools.recording.file_names import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import align_racks
 from rack.tools.report.report import write_report
@@ -72,6 +73,12 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
     assert shown.ticks.tolist() == ticks.tolist()
 
 
+def has_spooled(run: Path, frames: int) -> bool:
+    """Check whether the recorder has written this many frames of rows."""
+    spool = run / SPOOL
+    return spool.is_file() and spool.read_bytes().count(b"\n") > frames
+
+
 @pytest.mark.slow
 def test_the_recording_so_far_is_saved_while_the_run_continues(
     small: Path, rack_name: str, tmp_path: Path
@@ -86,7 +93,8 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
         stdout=subprocess.DEVNULL,
     ) as process:
         try:
-            wait_until(lambda: (run / "run.rrd").is_file(), WATCHDOG_S)
+            # Some rows of every ring are on the disk.
+            wait_until(lambda: has_spooled(run, 10), WATCHDOG_S)
             command = [*RACK, "record", "--save", rack_name, "--out", str(saved), "--json"]
             done = run_command(command, WATCHDOG_S, text=True)
             status = run_command([*RACK, "status", rack_name], WATCHDOG_S, text=True)
