@@ -120,9 +120,14 @@ class Writer:
         Readers reject what that process publishes from now on. Only a standby may call this, while
         it holds the lock on the hand-over: see `rack.backplane.standby`.
         """
-        self.claim.try_lock()
-        head = self.slots.find_newest()
-        self.claim.begin_epoch(head)
+        claim, slots = self.claim, self.slots
+        claim.try_lock()
+        former = slots.box[Box.CLAIMANT]
+        claim.begin_epoch(slots.find_newest(former))
+        # The former writer may have published until its claim was replaced.
+        slots.fence()
+        head = slots.find_newest(former)
+        claim.set_begun(head)
         self._continue_after(head)
 
     def _continue_after(self, head: int) -> None:

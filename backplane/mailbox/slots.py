@@ -185,19 +185,24 @@ class Slots:
                 self.chain = (words[_CHECK] & UNSIGNED) ^ (words[_EPOCH] & EPOCH_MASK)
                 break
 
-    def find_newest(self) -> int:
-        """Return the serial of the newest message that the claimant of the mailbox has published.
+    def find_newest(self, claimant: int) -> int:
+        """Return the serial of the newest message that a writer has published.
 
-        The head differs from it if a writer that was stopped and replaced has published since.
+        The head differs from it if an earlier writer that was stopped has published since.
+
+        Args:
+            claimant: Signature of the writer. Its epoch is the newest, or the one before.
         """
-        claimant = self.box[Box.CLAIMANT]
         begun = self.box[Box.BEGUN + get_epoch(claimant) % Box.EPOCHS]
         # A stopped writer may store this word at any time, so load it once.
         head = max(self.box[Box.HEAD], begun)
         own = (words[_SERIAL] for words in self.heads if words[_EPOCH] == claimant)
         newest = max(own, default=begun)
-        # The slot of a lost message still contains an older one.
-        is_lost = self.heads[head & self.mask][_SERIAL] == head - self.depth
+        # The slot of a lost message still contains an older one, or was never filled. A slot that
+        # was cleared has a signature.
+        slot = self.heads[head & self.mask]
+        is_cleared = slot[_SERIAL] == 0 != slot[_EPOCH]
+        is_lost = slot[_SERIAL] == head - self.depth and not is_cleared
         is_set_back = newest > head + 1
         is_set_ahead = newest < head and not is_lost
         return newest if is_set_back or is_set_ahead else head
@@ -284,6 +289,8 @@ class Slots:
         self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
         self.fence()
         self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
+        # The claim is loaded after that.
+        self.fence()
 
     def fetch_message(self, serial: int) -> bool:
         """Copy the message with the given serial into the local record.

@@ -108,6 +108,7 @@ def take(port: Any, serial: int) -> bool:
     copy(port.record, slot, SIGNED_FROM)
     fence()
     copy(port.record + SIGNED_FROM, slot + SIGNED_FROM, port.size - SIGNED_FROM)
+    fence()
     received = slot_at(port.record)
     state = state_at(port.state)
     if received.serial != serial or received.signature != state.signature:

@@ -18,9 +18,9 @@ permit, and loads are speculated. Copies access their words in any order under a
 one for all: a store becomes visible to all others at once, as on x86-64 and ARMv8. What a dead
 writer has stored is visible before its successor begins, which gets the kernel's lock from it.
 
-`PUBLISH`, `LOSE`, `CLAIM`, `READ` and `JUDGE` are the accesses of the code, in order; test_model.py
-compares them with those that the code makes. A reader chooses any message that it may find visible;
-so the model covers reads by ticks, of the newest message, and those that step back.
+`PUBLISH`, `LOSE`, `CLAIM`, `TAKE_OVER`, `READ` and `JUDGE` are the accesses of the code, in order;
+test_model.py compares them with those that the code makes. A reader chooses any message that it may
+find visible; so the model covers reads by ticks, of the newest message, and those that step back.
 """
 
 from __future__ import annotations
@@ -33,7 +33,11 @@ from typing import NamedTuple
 PUBLISH = ("fence", "store message", "fence", "store signature", "fence", "store head")
 LOSE = ("fence", "store head")
 CLAIM = ("store begun", "fence", "store claim", "clear slot")
-READ = ("load head", "fence", "load signature", "fence", "load message", "load claim")
+TAKE_OVER = (
+    *("store begun", "fence", "store claim", "fence"),
+    *("load head", "store begun", "clear slot"),
+)
+READ = ("load head", "fence", "load signature", "fence", "load message", "fence", "load claim")
 FORMER = ("fence", "load begun")
 """Further accesses by which a reader checks a message of an earlier epoch than that of the claim.
 The model makes them together with the load of the claim: what a word contains does not change while
@@ -74,7 +78,7 @@ class Setup:
             Words of one group are copied together.
         publish: Accesses of a writer that publishes a message.
         lose: Accesses of a writer that publishes a serial without its message.
-        claim: Accesses of a writer that begins.
+        claim: Accesses of a writer that begins. With stops, `TAKE_OVER` is what the code does.
         read: Accesses of a reader that takes a message.
         judge: Accesses of a reader after a bad copy.
         is_checked: True if a reader checks the checksum.
@@ -129,6 +133,7 @@ class Writer(NamedTuple):
     epoch: int
     issued: int  # newest serial whose stores are among these, or made
     stores: tuple[Store, ...]
+    claims_after: int = 0  # epoch of the writer whose newest message it still has to load again
     buffer: tuple[Store, ...] = ()  # under TSO: made, and not yet visible
     is_alive: bool = True
     is_stopped: bool = False
@@ -156,7 +161,7 @@ class State(NamedTuple):
     begun: tuple[int, ...]  # serial of the newest message when an epoch began, by epoch
     slots: tuple[tuple[int, ...], ...]
     # Of the writers of all published messages: of none of a serial that is forged or lost, of two
-    # if a stopped writer published it just before the next epoch began.
+    # if a successor was killed before it had found what a stopped writer published.
     epochs: tuple[tuple[int, ...], ...]
     writers: tuple[Writer, ...]
     readers: tuple[Reader, ...]
@@ -219,6 +224,7 @@ class _Model:
         # Without acquire a reader may copy what it guesses that it will find.
         self._is_speculated = self._is_unordered(setup.read, "load head", "load signature")
         self._is_signed_early = not self._is_unordered(setup.read, "load signature", "load message")
+        self._is_claim_early = self._is_unordered(setup.read, "load message", "load claim")
         # Without a fence it may know the head early.
         self._is_early = self._is_weak and "fence" not in setup.judge
 
@@ -278,6 +284,11 @@ class _Model:
         if not writer.is_stopped:
             for step, after, changed in self._turns(state, writer):
                 yield step, moved(after)._replace(**changed)
+            if writer.claims_after and not (writer.stores or writer.buffer):
+                head, found = self._find_newest(state, writer.claims_after)
+                rest = self._list_claim_stores(state, writer.epoch, head, is_second=True)
+                after = writer._replace(issued=head, stores=rest, claims_after=0)
+                yield "load head again", moved(after, found)
             writer = self._continued(writer)
         if self._setup.memory is Memory.TSO:
             for store in writer.stores[:1]:
@@ -295,13 +306,13 @@ class _Model:
             yield f"lose {losing.issued}", losing, {"losses": state.losses - 1}
         writer = self._continued(writer)
         # A process that is stopped while it claims keeps others from taking over.
-        if state.stops and all(store.publication for store in (*writer.stores, *writer.buffer)):
+        is_claiming = writer.claims_after or not all(
+            store.publication for store in (*writer.stores, *writer.buffer)
+        )
+        if state.stops and not is_claiming:
             yield "stop the writer", self._stopped(writer), {"stops": state.stops - 1}
         if state.kills:
-            # Before the first store of its claim it has taken no epoch: its successor takes that.
-            is_begun = not {"begun", "claim"} <= {store.place for store in writer.stores}
-            epoch = writer.epoch if is_begun else writer.epoch - 1
-            dead = Writer(epoch, 0, (), writer.buffer, is_alive=False)
+            dead = Writer(writer.epoch, 0, (), writer.buffer, is_alive=False)
             yield "kill the writer", dead, {"kills": state.kills - 1}
 
     def _stopped(self, writer: Writer) -> Writer:
@@ -319,7 +330,7 @@ class _Model:
     def _may_issue(self, writer: Writer) -> bool:
         """Check whether a writer may begin with one more publication."""
         begun = {store.publication for store in writer.stores} - {0}
-        return writer.issued < self._last and len(begun) < self._ahead
+        return not writer.claims_after and writer.issued < self._last and len(begun) < self._ahead
 
     def _continued(self, writer: Writer) -> Writer:
         """Return the writer with the stores of all publications that it may work on."""
@@ -380,8 +391,9 @@ class _Model:
                 epochs = list(state.epochs)
                 serial = store.value // EPOCHS
                 if is_lawful and set(words) == {store.value} and 0 < serial <= state.head:
-                    # A message takes the place of a forged one that was published.
-                    epochs[serial] = (writer.epoch,)
+                    # It takes the place of a forged message, or of one of a stopped writer.
+                    before = [one for one in epochs[serial] if one != writer.epoch]
+                    epochs[serial] = (*before, writer.epoch)
                 return state._replace(slots=tuple(slots), epochs=tuple(epochs))
         epochs = [*state.epochs, ()][: max(len(state.epochs), store.value + 1)]
         before = epochs[store.value]
@@ -390,7 +402,7 @@ class _Model:
         elif writer.is_stopped:
             # It sets the head back, or to the serial on which its successor works.
             words = state.slots[store.value % self._setup.depth]
-            if set(words) == {store.value * EPOCHS + state.claim}:
+            if set(words) == {store.value * EPOCHS + state.claim} and state.claim not in before:
                 epochs[store.value] = (*before, state.claim)
         else:
             raise Violation("a message is published without the valid claim")
@@ -401,31 +413,87 @@ class _Model:
         *_, last = state.writers
         setup = self._setup
         is_gone = not last.is_alive and not last.buffer
-        if last.epoch > setup.kills + setup.stops:
-            return
         if not (is_gone or last.is_stopped or not setup.is_locked):
             return
-        epoch = last.epoch + 1
+        # A writer that was killed before it stored its claim has used no epoch.
+        if (state.claim if is_gone else last.epoch) > setup.kills + setup.stops:
+            return
+        epoch = state.claim + 1
+        head, state = self._find_newest(state, state.claim)
+        stores = self._list_claim_stores(state, epoch, head)
+        after = state.claim if "load head" in setup.claim else 0
+        # What the dead one has left is in memory by now.
+        others = () if is_gone else state.writers
+        writer = Writer(epoch, head, stores, after)
+        yield f"begin, epoch {epoch}", state._replace(writers=(*others, writer))
+
+    def _find_newest(self, state: State, claim: int) -> tuple[int, State]:
+        """Return the serial after which a successor continues, as `Slots.find_newest` does.
+
+        Args:
+            state: State of memory.
+            claim: Epoch of the writer before.
+
+        Returns:
+            The serial; and the state, in which all messages up to it are published.
+        """
+        setup = self._setup
+        head = state.head
+        if "load head" not in setup.claim:
+            return head, state
+        begun = state.begun[claim]
+        head = max(head, begun)
+        own = [
+            words[self._serial] // EPOCHS
+            for words in state.slots
+            if words[self._epoch] and words[self._epoch] % EPOCHS == claim
+        ]
+        newest = max(own, default=begun)
+        words = state.slots[head % setup.depth]
+        is_lost = words[self._serial] // EPOCHS == head - setup.depth
+        is_lost = is_lost and (words[self._serial] > 0 or not words[self._epoch])
+        if newest > head + 1 or (newest < head and not is_lost):
+            head = newest
+        epochs = [*state.epochs, *[()] * (head + 1 - len(state.epochs))]
+        for serial in range(max(1, head - setup.depth + 1), head + 1):
+            signature = state.slots[serial % setup.depth][self._epoch]
+            # Another stopped writer may have damaged it since.
+            if signature == serial * EPOCHS + claim and claim not in epochs[serial]:
+                epochs[serial] = (*epochs[serial], claim)
+        return head, state._replace(epochs=tuple(epochs))
+
+    def _list_claim_stores(
+        self, state: State, epoch: int, head: int, is_second: bool = False
+    ) -> tuple[Store, ...]:
+        """Return the stores of a claim.
+
+        Args:
+            state: State of memory.
+            epoch: Epoch of the writer.
+            head: Serial after which it continues.
+            is_second: True for those after the head was loaded again.
+        """
+        accesses = self._setup.claim
+        again = accesses.index("load head") if "load head" in accesses else len(accesses)
         stores: list[Store] = []
         section = 0
-        for number, access in enumerate(setup.claim):
+        for number, access in enumerate(accesses):
             common = {"section": section, "access": number}
             if access == "fence":
                 section += 1
+            elif (number > again) != is_second:
+                continue
             elif access == "store begun":
-                stores.append(Store("begun", state.head, **common))
+                stores.append(Store("begun", head, **common))
             elif access == "store claim":
                 stores.append(Store("claim", epoch, **common))
             elif access == "clear slot":
                 stores += [
                     Store("slot", EMPTY, at, self._serial, **common)
                     for at, words in enumerate(state.slots)
-                    if words[self._serial] // EPOCHS > state.head
+                    if words[self._serial] // EPOCHS > head
                 ]
-        # What the dead one has left is in memory by now.
-        others = () if is_gone else state.writers
-        writer = Writer(epoch, state.head, tuple(stores))
-        yield f"begin, epoch {epoch}", state._replace(writers=(*others, writer))
+        return tuple(stores)
 
     def _is_publishing(self, writer: Writer) -> bool:
         """Check whether a writer has made some of the stores of a publication."""
@@ -467,7 +535,7 @@ class _Model:
                 after = self._concluded(state, reader._replace(copied=copied))
                 yield f"load word {word} of slot {reader.serial % self._setup.depth}", after
         is_whole = min(reader.copied) >= 0
-        if reader.claim < 0 and (self._is_weak or (is_whole and self._is_good(reader))):
+        if reader.claim < 0 and (self._is_claim_early or (is_whole and self._is_good(reader))):
             known = reader._replace(claim=state.claim, begun=state.begun)
             after = self._concluded(state, known)
             yield "load claim", after
@@ -549,6 +617,9 @@ class _Model:
             published.append(reader.serial * EPOCHS + state.claim)
         if message not in published:
             raise Violation("a reader returns a message that was not published")
+        is_single = self._setup.stops < 2 and not self._setup.kills
+        if is_single and len(state.epochs[reader.serial]) > 1:
+            raise Violation("two messages of one serial are published")
         if reader.serial <= reader.last:
             raise Violation("a reader returns messages out of order")
 

@@ -12,6 +12,7 @@ from tests.backplane.mailbox.model import (
     LOSE,
     PUBLISH,
     READ,
+    TAKE_OVER,
     Exploration,
     Memory,
     Setup,
@@ -33,10 +34,14 @@ TAKE_OVERS: dict[str, dict[str, Any]] = {
     "a take-over": {"kills": 0},
     "a take-over and a kill": {"kills": 1},
     "two reads and a take-over": {"kills": 0, "reads": 2},
+    "two take-overs": {"kills": 0, "stops": 2},
+    "two take-overs and a kill": {"kills": 1, "stops": 2},
 }
-"""What may happen while a stopped writer is replaced, and still stores a message."""
+"""What may happen while stopped writers are replaced, and each still stores a message."""
+STOPPED: dict[str, Any] = {"kills": 0, "stops": 1, "words": COARSE, "claim": TAKE_OVER}
 NOT_PUBLISHED = "a reader returns a message that was not published"
 NOT_BAD = "a reader takes a published message for a bad one"
+TWO_OF_ONE_SERIAL = "two messages of one serial are published"
 NO_CLAIM = "a message is published without the valid claim"
 WAITS = "a reader waits"
 MUTANTS: dict[str, tuple[dict[str, Any], str]] = {
@@ -80,15 +85,23 @@ MUTANTS: dict[str, tuple[dict[str, Any], str]] = {
         NOT_PUBLISHED,
     ),
     "message of a stopped writer accepted": (
-        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_bounded": False, "words": COARSE},
+        {"memory": Memory.SC, **STOPPED, "is_bounded": False},
         NOT_PUBLISHED,
     ),
     "checksum without the epoch": (
-        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_bound": False, "words": COARSE},
+        {"memory": Memory.SC, **STOPPED, "is_bound": False},
         NOT_PUBLISHED,
     ),
     "claim not loaded for a known writer": (
-        {"memory": Memory.SC, "kills": 0, "stops": 1, "is_claim_loaded": False, "words": COARSE},
+        {"memory": Memory.SC, **STOPPED, "is_claim_loaded": False},
+        NOT_PUBLISHED,
+    ),
+    "head not loaded again after the claim": (
+        {"memory": Memory.SC, **STOPPED, "claim": CLAIM},
+        TWO_OF_ONE_SERIAL,
+    ),
+    "relaxed load of the claim": (
+        {"memory": Memory.WEAK, **STOPPED, "stops": 2, "messages": 1, "read": (*READ[:5], READ[6])},
         NOT_PUBLISHED,
     ),
     "claim before its bound": (
@@ -121,7 +134,11 @@ def test_the_protocol_holds_in_every_state(memory: Memory, case: str) -> None:
 def test_the_protocol_holds_in_every_state_of_a_take_over(
     memory: Memory, messages: int, case: str
 ) -> None:
-    exploration = found(memory=memory, messages=messages, stops=1, words=COARSE, **TAKE_OVERS[case])
+    settings = {"stops": 1, **TAKE_OVERS[case]}
+    # Two stopped writers have many more states.
+    messages = messages if settings["stops"] == 1 else 1
+    settings |= {"messages": messages, "words": COARSE, "claim": TAKE_OVER}
+    exploration = found(memory=memory, **settings)
     assert (exploration.violation, exploration.steps) == ("", ())
     assert exploration.states > 1_000
 

@@ -21,7 +21,7 @@ from rack.levels import compiled as compilation
 from rack.levels.compiled import compiled
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.backplane.mailbox.model import CLAIM, JUDGE, LOSE, PUBLISH, READ
+from tests.backplane.mailbox.model import CLAIM, JUDGE, LOSE, PUBLISH, READ, TAKE_OVER
 
 WORDS = {
     Box.HEAD: "head",
@@ -126,12 +126,19 @@ def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...
     }
     # A writer that dies before it publishes what it has filled.
     writer.slots.serial += 1
-    writer.slots.heads[writer.slots.serial & writer.slots.mask]._words[Slot.SERIAL] = 4
+    filled = writer.slots.heads[writer.slots.serial & writer.slots.mask]._words
+    filled[Slot.SERIAL] = 4
     writer.close()
     # It continues after the newest message and the newest epoch.
     loads = ("load head", "load claim")
     claim = made(lambda: Writer(segment, NAME).close())
     found["claim"] = tuple(access for access in claim if access not in loads)
+    filled[Slot.SERIAL] = 4
+    standby = Writer(segment, NAME, is_held=True)
+    taken = made(standby.take_over)
+    # What it loads before the first store, the claim and the bounds decide nothing in the model.
+    later = taken[taken.index("store begun") :]
+    found["take over"] = tuple(one for one in later if one not in ("load claim", "load begun"))
     return found
 
 
@@ -142,6 +149,7 @@ EXPECTED = {
     "read": READ,
     "judge": JUDGE,
     "claim": CLAIM,
+    "take over": TAKE_OVER,
 }
 
 
@@ -184,6 +192,7 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     "signature before message": (Slots, "publish_message", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
     "relaxed load of the head": (Reader, "read", "slots.fence()\n", "pass\n"),
     "signature loaded after the message": (Slots, "load_slot", FENCE, "pass\n"),
+    "relaxed load of the claim": (Slots, "load_slot", f"that.\n    {FENCE}", "that.\n"),
     "no fence before a copy is judged": (Slots, "is_intact", FENCE, "pass\n"),
     "slots of a dead writer left filled": (
         Slots,
@@ -303,7 +312,12 @@ MACHINE_MUTANTS: dict[str, tuple[str, str, str]] = {
     ),
     "signature before message": ("publish", "    fence()\n    copy(slot, ", "    copy(slot, "),
     "relaxed load of the head": ("read_port", "load(port.head)", "slot_at(port.head).stamp"),
-    "signature loaded after the message": ("take", "    fence()\n", ""),
+    "signature loaded after the message": (
+        "take",
+        "    fence()\n    copy(port.record",
+        "    copy(port.record",
+    ),
+    "relaxed load of the claim": ("take", "    fence()\n    received", "    received"),
 }
 """Mistakes in the compiled functions: function, its text and another one."""
 

@@ -24,7 +24,6 @@ from rack.tools.commands.replay import replay
 from rack.tools.console import interrupt
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
-from rack.tools.recording.file_names import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import align_racks
 from rack.tools.report.report import write_report
@@ -33,6 +32,7 @@ from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts
 from tests.processes import RACK, wait_until
 from tests.tools.machines import A, B, recorded
+from tests.tools.recording.struck_recorders import has_spooled
 from tests.warm import Popen, run_command
 
 pytestmark = pytest.mark.thorough
@@ -71,12 +71,6 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
     assert ticks[-1] == rack.outcome.ticks - 1
     shown = read_component(folder / "run.rrd", "/signals/lower.status/count")
     assert shown.ticks.tolist() == ticks.tolist()
-
-
-def has_spooled(run: Path, frames: int) -> bool:
-    """Check whether the recorder has written this many frames of rows."""
-    spool = run / SPOOL
-    return spool.is_file() and spool.read_bytes().count(b"\n") > frames
 
 
 @pytest.mark.slow

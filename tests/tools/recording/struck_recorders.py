@@ -18,6 +18,7 @@ from rack.boards.config import RackConfig
 from rack.boards.events import Event
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
+from rack.tools.recording.file_names import SPOOL
 from rack.tools.recording.recording import Recording
 from tests.warm import programs
 
@@ -82,20 +83,35 @@ class Held(AtTick):
     """Strikes while a rack in lockstep, launched with `step`, is held at the tick.
 
     The run cannot end before the strike, however late a busy machine lets the display look.
-    Afterwards the rack continues.
+    Afterwards the rack continues. With `run`, the folder of the run, it also waits for first rows
+    on the disk.
     """
 
-    def __init__(self, rack: str, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1):
+    def __init__(
+        self,
+        rack: str,
+        number: signal.Signals,
+        tick: int = FIRST_BLOCK,
+        times: int = 1,
+        run: Path | None = None,
+    ) -> None:
         super().__init__(number, -1, times=times)
-        self._rack, self._hold_at = rack, tick + 1
+        self._rack, self._hold_at, self._run = rack, tick + 1, run
 
     def show(self, snapshot: Snapshot) -> None:
         """Let the rack run to the tick, and strike there."""
         with closing(Segment.attach(self._rack)) as segment:
-            if segment.words[System.HELD] == self._hold_at:
+            has_rows = self._run is None or has_spooled(self._run, 1)
+            if segment.words[System.HELD] == self._hold_at and has_rows:
                 super().show(snapshot)
             is_done = len(self.struck) == self._times
             segment.words[System.HOLD_AT] = 0 if is_done else self._hold_at
+
+
+def has_spooled(run: Path, frames: int) -> bool:
+    """Check whether the recorder has written this many frames of rows."""
+    spool = run / SPOOL
+    return spool.is_file() and spool.read_bytes().count(b"\n") > frames
 
 
 class FillingDisk(AtTick):

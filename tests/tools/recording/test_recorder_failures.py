@@ -136,9 +136,10 @@ def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
 def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = Held(config.name, signal.SIGKILL, times=recorder_process.MAX_RESTARTS + 1)
-    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
-    assert len(display.struck) == recorder_process.MAX_RESTARTS + 1
+    times, run = recorder_process.MAX_RESTARTS + 1, tmp_path / "run"
+    display = Held(config.name, signal.SIGKILL, times=times, run=run)
+    result = run_rack(config, LONG_S, run, display, step=True)
+    assert len(display.struck) == times
     assert (result.outcome.is_success, result.worked) == (True, False)
     recording, ticks = Recording(tmp_path / "run"), result.outcome.ticks
     taken = counts(recording)
