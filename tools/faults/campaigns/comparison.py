@@ -42,8 +42,9 @@ class Outages:
         median_ticks: Median of the ticks from a fault to the next cycle that writes messages. None
             if no fault interrupted the output.
         max_ticks: Longest such time.
-        braked: Number of faults after which brakes engaged.
-        missed: Number of messages missing in the mailboxes of the board, in all trials.
+        braked: Number of faults that made the brakes engage before there was output again.
+        missed: Number of messages missing in the mailboxes of the board, in all trials. Those of
+            ticks that the clock skipped are not counted.
         recovered: Number of faults after which the rack recovered.
     """
 
@@ -138,13 +139,14 @@ def build_comparison(
 def _summarize_outages(name: str, results: Results) -> Outages:
     """Summarize the effects of a campaign's faults on the output of their board."""
     faults = [fault for fault in results.faults if fault.struck >= 0]
-    outages = [ticks for run in results.trials for ticks in run.outages]
+    outages = [outage for run in results.trials for outage in run.outages]
+    ticks = [outage.ticks for outage in outages]
     return Outages(
         board=name,
         faults=len(faults),
-        median_ticks=median(outages) if outages else None,
-        max_ticks=max(outages, default=None),
-        braked=sum("brakes_closed" in fault.reactions for fault in faults),
+        median_ticks=median(ticks) if ticks else None,
+        max_ticks=max(ticks, default=None),
+        braked=sum(outage.has_braked for outage in outages),
         missed=sum(run.missing for run in results.trials),
         recovered=sum(fault.is_recovered for fault in faults),
     )

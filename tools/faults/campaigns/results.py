@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Document, write_json
-from rack.tools.faults.campaigns.outages import list_outages
+from rack.tools.faults.campaigns.outages import Outage, list_outages
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.statistics import EventRate, compute_rate
 from rack.tools.faults.campaigns.trial import Trial
@@ -67,7 +67,7 @@ class TrialResult:
     shortfalls: tuple[str, ...]
     start: int = 0
     whole: str = ""
-    outages: tuple[int, ...] = ()
+    outages: tuple[Outage, ...] = ()
     missing: int = 0
     begins: tuple[int, ...] = ()
 

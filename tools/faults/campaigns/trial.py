@@ -237,7 +237,7 @@ def run_trial(
             trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)
             find_board = rack.segment.layout.find_first_copy
             boards = {find_board(strike.board) for strike in trial.strikes}
-            trial.missing = count_missing_messages(rack.segment, boards)
+            trial.missing = count_missing_messages(rack.segment, boards, rack.events)
             if pacer is not None:
                 trial.begin_ticks = pacer.begin_ticks
             trial.arm = read_arm(rack.segment)

@@ -15,6 +15,7 @@ from rack.tools.faults.campaigns.comparison import list_standby_settings, remove
 from rack.tools.faults.campaigns.outages import count_missing_messages, list_outages
 from rack.tools.faults.campaigns.plan import Plan, strike_active_copies
 from rack.tools.faults.ending import Strike
+from rack.tools.faults.evidence import BRAKES, SKIPPED
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.tools.command_line import rack
@@ -48,7 +49,9 @@ def test_an_outage_ends_when_a_copy_takes_over_or_the_board_is_back(small: Path)
     events = [
         Event(0, 12, "recovery", "upper", "", code="rejoined"),
         Event(0, 15, "recovery", "lower.standby", "", code="taken_over"),
+        Event(0, 16, "reaction", "upper", "", code=BRAKES),
         Event(0, 90, "recovery", "lower", "", code="rejoined"),
+        Event(0, 93, "reaction", "lower", "", code=BRAKES),
     ]
     strikes = [
         Strike(number, kind, board, tick, tick + 1, tick)
@@ -62,7 +65,7 @@ def test_an_outage_ends_when_a_copy_takes_over_or_the_board_is_back(small: Path)
             ]
         )
     ]
-    assert [*list_outages(strikes, events, layout)] == [5, 70]
+    assert [*list_outages(strikes, events, layout)] == [(5, True), (70, False)]
 
 
 def test_missing_messages_are_counted_up_to_the_newest(
@@ -72,12 +75,14 @@ def test_missing_messages_are_counted_up_to_the_newest(
     writer = open_writer(segment, NAME)
     for tick in (0, 2, 8):
         writer.write(tick)
-    assert count_missing_messages(segment, {"writer"}) == 2
-    assert count_missing_messages(segment, {"reader"}) == 0
+    skipped = [Event(0, 7, "miss", name, "", code=SKIPPED, value=2, since=5) for name in "ab"]
+    assert count_missing_messages(segment, {"writer"}, ()) == 2
+    assert count_missing_messages(segment, {"writer"}, skipped) == 1
+    assert count_missing_messages(segment, {"reader"}, ()) == 0
     standby = open_standby_writer(segment, NAME)
     standby.take_over()
     standby.write(10)
-    assert count_missing_messages(segment, {"writer"}) == 2
+    assert count_missing_messages(segment, {"writer"}, ()) == 2
 
 
 @pytest.mark.slow
