@@ -18,6 +18,7 @@ from tests import golden
 from tests.machine import needs_lab
 from tests.processes import RACK
 from tests.snapshots import Snapshots
+from tests.tools.command_line import rack
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(300), needs_lab]
 
@@ -61,8 +62,9 @@ def test_on_one_machine_in_lockstep_the_hand_over_is_the_same_everywhere(tmp_pat
     racks, _ = BLOCKS
     script = ["ip link set lo up"]
     for words in racks:
-        command = shlex.join([*RACK, *words, "--lockstep", "--no-record", "--json"])
-        script.append(f"{command} >{file_name(words)}.json 2>{file_name(words)}.err &")
+        name = file_name(words)
+        command = shlex.join([*RACK, *words, "--lockstep", "--out", name, "--json"])
+        script.append(f"{command} >{name}.json 2>{name}.err &")
     command = "\n".join([*script, "wait"])
     subprocess.run(
         [*ONE_MACHINE, *OWN_MEMORY, "bash", "-c", command], cwd=tmp_path, timeout=MOST_S, check=True
@@ -70,3 +72,11 @@ def test_on_one_machine_in_lockstep_the_hand_over_is_the_same_everywhere(tmp_pat
     found = outcomes(tmp_path, racks)
     if golden.machine()["libm"] == golden.read()["machine"]["libm"]:
         SNAPSHOTS.check("lockstep", {name: report["digest"] for name, report in found.items()})
+    done = rack("analyze", *(tmp_path / name for name in found), "--json")
+    across = json.loads(done.stdout)["across"]
+    assert (done.returncode, len(across)) == (0, 4)
+    measured = [one for one in across if one["count"]]
+    assert "status" in {one["direction"] for one in measured}
+    for response in measured:
+        assert response["measured_ms"]["max"] == pytest.approx(response["bound_ms"])
+        assert response["holds"]
