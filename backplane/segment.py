@@ -332,10 +332,13 @@ class Segment:
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task up to `tick`.
 
-        A release that the task has not finished is counted as skipped once its time slice is over.
+        A release that the task has not finished is counted as skipped once its time slice is over,
+        but not while a plan that was begun in it is still in time.
         """
         block = self.get_block(task.name)
-        skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
+        skipped = block[Block.SKIPPED]
+        if block[Block.DEADLINE] <= max(tick, block[Block.RELEASED] + task.every):
+            skipped += task.count_unfinished(block[Block.DONE], tick)
         return CycleCounts(
             block[Block.MISSED], skipped, task.count_unfinished(-1, tick), task.within_cycles
         )

@@ -15,7 +15,7 @@ import pytest
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import VERSION, Segment, get_shm_path, list_racks, unlink_segment
 from rack.backplane.words import Block, Head, System
-from tests.backplane.bus import layout, mailbox
+from tests.backplane.bus import layout, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import (
     BOUND_S,
@@ -69,6 +69,21 @@ def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus
         segment.get_block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)
     ] == [-1] * 4
     assert [segment.words[System.SYSFAIL + slot] for slot in (1, 2, 3, 4)] == [0, 1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("deadline", "tick", "skipped"),
+    [(8, 7, 0), (8, 8, 1), (8, 12, 2), (40, 39, 0), (40, 40, 9)],
+    ids=["in time", "late", "lost", "planning", "plan late"],
+)
+def test_an_unfinished_release_is_skipped_unless_its_plan_is_in_time(
+    make_bus: MakeBus, deadline: int, tick: int, skipped: int
+) -> None:
+    spec = task("writer", every=4)
+    segment = make_bus(spec)
+    block = segment.get_block(spec.name)
+    block[Block.DONE], block[Block.RELEASED], block[Block.DEADLINE] = 0, 4, deadline
+    assert segment.count_cycles(spec, tick).skipped == skipped
 
 
 def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus) -> None:

@@ -27,6 +27,7 @@ HOST = "127.0.0.1"
 PORT_VARIABLE = "FOXGLOVE_PORT"
 PORT = 8765
 """Port to which Foxglove connects by default."""
+MAX_PORT = 65535
 
 
 class FoxgloveBridge(TopicBridge):
@@ -44,7 +45,9 @@ class FoxgloveBridge(TopicBridge):
             task.name: foxglove.Channel(f"/timing/{task.name}", context=self._context)
             for task in segment.layout.tasks
         }
-        port = os.environ.get(PORT_VARIABLE) or PORT
+        port = os.environ.get(PORT_VARIABLE) or f"{PORT}"
+        if not (port.isdecimal() and int(port) <= MAX_PORT):
+            raise Failure(f"{PORT_VARIABLE} = {port}: must be from 0 to {MAX_PORT}", 2)
         listener: Any = self
         try:
             self._server = foxglove.start_server(
@@ -54,7 +57,7 @@ class FoxgloveBridge(TopicBridge):
                 server_listener=listener,
                 context=self._context,
             )
-        except (OSError, RuntimeError, OverflowError, ValueError) as error:
+        except (OSError, RuntimeError) as error:
             raise Failure(f"{PORT_VARIABLE} = {port}: {error}") from None
         tell(f"open ws://{HOST}:{self._server.port} in Foxglove")
 

@@ -145,8 +145,14 @@ def test_mistakes_are_one_line_each(
         (("nowhere", "ros2"), ""): (1, "rack 'nowhere' does not exist"),
         ((shown.name, "ros1"), ""): (2, "known bridges: ros2, foxglove, or package.module:Class"),
         ((shown.name, "own_bridges:NoBridge"), ""): (2, "has no RackBridge named 'NoBridge'"),
-        ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (1, "FOXGLOVE_PORT = many: "),
-        ((shown.name, "foxglove"), "FOXGLOVE_PORT=99999"): (1, "FOXGLOVE_PORT = 99999: "),
+        ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (
+            2,
+            "FOXGLOVE_PORT = many: must be from 0 to",
+        ),
+        ((shown.name, "foxglove"), "FOXGLOVE_PORT=99999"): (
+            2,
+            "FOXGLOVE_PORT = 99999: must be from 0",
+        ),
         ((shown.name, "ros2"), "ROS_DOMAIN_ID=300"): (2, "ROS_DOMAIN_ID = 300: must be from 0 to"),
         ((shown.name, "ros2"), "ZENOH_SESSION_CONFIG_URI=/missing.json5"): (1, "zenoh: "),
     }
