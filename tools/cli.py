@@ -45,8 +45,8 @@ COMMANDS = {
         "record": "Record a running rack.",
         "replay": "Open recordings in the viewer, several racks on one time line.",
         "plot": "Plot signals of a run, or of a running rack.",
-        "picture": "Draw the viewer's first view of a run, or its cell.",
-        "export": "Write a recorded run as an MCAP file.",
+        "picture": "Draw a view of a recorded run, without a screen.",
+        "export": "Write a recorded run as MCAP, rosbag2 or Perfetto.",
         "report": "Report on a recorded run, or compare two runs.",
         "bridge": "Connect a running rack to ROS 2 or Foxglove.",
     },
@@ -72,7 +72,7 @@ COMMANDS = {
         "robot": "Bring up any arm, from a model file.",
     },
     "Reach others": {
-        "lan": "Prepare racks that work together over a network.",
+        "lan": "Make certificates for racks on a network.",
     },
     "Look up": {
         "schema": "Show the keys of a config with their units and defaults.",

@@ -15,6 +15,7 @@ from typing import IO
 import pytest
 
 from rack.tools.cli import COMMANDS
+from rack.tools.commands.export import EXPORTERS
 from tests.processes import RACK
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -191,6 +192,11 @@ def test_help_has_a_whole_line_for_every_command_by_groups() -> None:
     )
     assert len({*NAMES}) == len(NAMES)
     assert "".join(listed.split()) in "".join(rack("--help").stdout.split())
+
+
+def test_the_help_line_of_export_names_every_kind_of_file() -> None:
+    line = COMMANDS["Watch"]["export"].lower()
+    assert [kind for kind in EXPORTERS if kind not in line] == []
 
 
 def test_the_printed_version_equals_the_version_of_the_project() -> None:

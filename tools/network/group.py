@@ -15,7 +15,7 @@ YEAR = 365
 
 @app.callback()
 def lan() -> None:
-    """Prepare racks for working together over a network."""
+    """Make certificates for racks that work together over a network."""
 
 
 @app.command()
