@@ -71,18 +71,21 @@ def run_bridge(name: str, segment: Segment, tell: Tell) -> None:
     Raises:
         Failure: There is no such bridge, a library is missing, or the connection failed.
     """
+    bridge_class = None
     try:
-        bridge = find_class(BRIDGES.get(name, name), RackBridge)(segment, tell)
-    except LookupError as error:
+        bridge_class = find_class(BRIDGES.get(name, name), RackBridge)
+        with closing(bridge_class(segment, tell)) as bridge:
+            _show_run(bridge, segment)
+    except Failure:
+        raise
+    except Exception as error:
+        # A bridge may choose and import a library only in its constructor.
         if name in BRIDGES and isinstance(error.__cause__, ImportError):
             why = f"{error.__cause__.name} is missing: pip install 'nasrem-rack[{name}]'"
             raise Failure(why) from None
-        known = ", ".join(BRIDGES)
-        raise Failure(f"{error}; known bridges: {known}, or package.module:Class", 2) from None
-    try:
-        with closing(bridge):
-            _show_run(bridge, segment)
-    except Exception as error:
+        if bridge_class is None:
+            known = ", ".join(BRIDGES)
+            raise Failure(f"{error}; known bridges: {known}, or package.module:Class", 2) from None
         raise Failure(f"{type(error).__name__}: {error}") from error
 
 

@@ -136,23 +136,33 @@ def test_clients_come_and_go_and_a_second_server_is_refused(shown: HeldRack) -> 
     wait_until(lambda: runs(shown.find_bridge()))
 
 
+OWN_BRIDGES = """
+from rack.tools.bridges.bridge import RackBridge
+
+class NoBridge: ...
+
+class Failing(RackBridge):
+    def __init__(self, segment, tell):
+        raise KeyError("no such signal")
+
+    def show_rows(self, ring, rows): ...
+    def advance(self, tick): ...
+    def close(self): ...
+"""
+
+
 def test_mistakes_are_one_line_each(
     shown: HeldRack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "own_bridges.py").write_text("class NoBridge: ...\n")
+    (tmp_path / "own_bridges.py").write_text(OWN_BRIDGES)
     monkeypatch.syspath_prepend(str(tmp_path))
     cases = {
         (("nowhere", "ros2"), ""): (1, "rack 'nowhere' does not exist"),
         ((shown.name, "ros1"), ""): (2, "known bridges: ros2, foxglove, or package.module:Class"),
         ((shown.name, "own_bridges:NoBridge"), ""): (2, "has no RackBridge named 'NoBridge'"),
-        ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (
-            2,
-            "FOXGLOVE_PORT = many: must be from 0 to",
-        ),
-        ((shown.name, "foxglove"), "FOXGLOVE_PORT=99999"): (
-            2,
-            "FOXGLOVE_PORT = 99999: must be from 0",
-        ),
+        ((shown.name, "own_bridges:Failing"), ""): (1, "KeyError: 'no such signal'"),
+        ((shown.name, "foxglove"), "FOXGLOVE_PORT=many"): (2, "FOXGLOVE_PORT = many: must be"),
+        ((shown.name, "foxglove"), "FOXGLOVE_PORT=99999"): (2, "FOXGLOVE_PORT = 99999: must be"),
         ((shown.name, "ros2"), "ROS_DOMAIN_ID=300"): (2, "ROS_DOMAIN_ID = 300: must be from 0 to"),
         ((shown.name, "ros2"), "ZENOH_SESSION_CONFIG_URI=/missing.json5"): (1, "zenoh: "),
     }
