@@ -8,6 +8,7 @@
 - `ProgramError`: a task program names an unknown object, verb or place.
 - `Refused`: a command cannot be carried out. A planner turns it into a status with its code and
   reason.
+- `RunOver`: a host program waits for an answer, and the run ends.
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ class LevelError(Exception):
 
 class CannotGoOn(LevelError):
     """A level cannot continue, and a restart would not help."""
+
+
+class RunOver(LevelError):
+    """A call of a host program cannot be completed because the run is over."""
 
 
 class RobotError(LevelError):

@@ -19,6 +19,7 @@ from rack.backplane.segment import Segment
 from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
+from rack.levels.errors import RunOver
 from rack.levels.host_program import HostProgram
 from rack.levels.references import find_class
 
@@ -61,6 +62,9 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
         program = find_class(wiring.target, HostProgram)(wiring.context)
         bus.connect_ports(program)
         program.run(bus)
+    except RunOver:
+        # The end of the run has interrupted the program, which is no failure of either.
+        pass
     except SystemExit as end:
         if end.code and not bus.is_over:
             return _report_failure(wiring.board, end)

@@ -13,6 +13,7 @@ from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.wiring import RecordedEntries
+from rack.levels.errors import RunOver
 from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import Executor, Input, Output
 
@@ -105,6 +106,16 @@ class Escaping(Host):
             os._exit(0)
         os.waitpid(child, 0)
         super().run(bus)
+
+
+class Persistent(Host):
+    """Sends numbers, until the end of the run refuses one."""
+
+    def run(self, bus: Bus) -> None:
+        while not bus.is_over:
+            self.send_number(1.0)
+            bus.wait(1.0)
+        raise RunOver("the run is over")
 
 
 class Silent(Host):

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rack.levels.errors import LevelError
+from rack.levels.errors import LevelError, RunOver
 from rack.levels.host_program import (
     Bus,
     HostProgram,
@@ -191,7 +191,7 @@ class Motions:
         request = {"body": WORLD_BODY, **fields, "id": self._newest + 1}
         while not self._send_request(request):
             if self._bus.is_over:
-                raise LevelError("the run is over")
+                raise RunOver("the run is over")
             self._wait_and_resend()
         self._newest += 1
         self._open_requests[self._newest] = request

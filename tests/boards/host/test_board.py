@@ -14,7 +14,7 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.history import find_chains
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config import resolve
 from rack.boards.host.bus import HostBus
@@ -96,6 +96,18 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
         assert (entry["passed"], entry["refused"], entry["superseded"]) == (50, 0, 0)
         assert 0 <= entry["arrived"] < outcome.ticks
     assert "died" not in codes(rack, "program")
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_program_that_the_end_of_the_run_interrupts_has_not_failed(
+    config: MakeConfig, mode: str
+) -> None:
+    settings = f"clock.mode={mode}", "host.program.program=host_programs:Persistent"
+    with Rack(config(*settings, text=HOSTED)) as rack:
+        rack.run(0.5)
+        block = rack.segment.get_block("program")
+        wait_until(lambda: block[Block.STATE] == TaskState.ENDED)
+    assert not {"died", "restart"} & {*codes(rack, "program")}
 
 
 @pytest.mark.slow

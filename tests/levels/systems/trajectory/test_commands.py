@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import copy_message
-from rack.levels.errors import LevelError
+from rack.levels.errors import LevelError, RunOver
 from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import (
     MotionKind,
@@ -112,3 +112,10 @@ def test_a_restarted_process_cancels_first_and_uses_new_numbers() -> None:
     arm.stay(0.1)
     sent = [(request.id, request.kind) for request in level.queue]
     assert sent == [(8, MotionKind.CANCEL), (9, MotionKind.STAY)]
+
+
+def test_a_request_that_finds_the_queue_full_at_the_end_of_the_run_is_given_up() -> None:
+    level = Level(room=0)
+    level.is_over = True
+    with pytest.raises(RunOver, match="the run is over"):
+        motions(level).move()
