@@ -24,17 +24,12 @@ from typing import Any
 
 from rack.backplane.words import Scheduler
 from rack.boards.timing.schedule import simulate_schedule
-from rack.boards.timing.tasks import Part, TimedTask, Unit
+from rack.boards.timing.tasks import TURN_NS, Part, TimedTask, Unit
 
 FIXED = Scheduler.FIXED_PRIORITY
 Load = tuple[int, int]
 """Demand of a task on its core: cost C of a job and period T, in the same unit."""
 
-TURN_NS = 4_000_000
-"""Longest time in ns that a task under ordinary scheduling runs while another waits.
-
-One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
-"""
 MAX_DEADLINES = 10
 """Number of deadlines after which the search ends, because it converges slowly near full load."""
 MAX_JOBS = 20_000

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
-from rack.boards.timing.tasks import Part, TimedTask, Unit, Urgency, compute_urgency
+from rack.boards.timing.tasks import TURN_NS, Part, TimedTask, Unit, Urgency, compute_urgency
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ def simulate_schedule(
     """Compute the schedule of tasks from time 0.
 
     A job has two context switches, one before its parts and one after them, which appear as idle
-    time. Ordinary scheduling (priority 0) is simulated as first come, first served.
+    time. Tasks of equal priority run in the order in which they began to wait. Under ordinary
+    scheduling (priority 0) they take turns of `TURN_NS`.
 
     Args:
         tasks: The tasks, on any cores. Each is first released at its phase.
@@ -181,6 +182,11 @@ class _TaskSimulation:
         self.task = task
         self.spans: list[Span] = []
         self.ready_at = task.phase_ns
+        # Time from which the task has waited for the core behind others of equal priority, and
+        # under ordinary scheduling the rest of its turn. A late task does not wait for a release,
+        # so it keeps its place.
+        self._queued_at = task.phase_ns
+        self._turn_ns = TURN_NS
         self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []
         # Remaining steps of the job, and the time already spent on the first of them.
         self._steps: list[Part] = []
@@ -205,7 +211,7 @@ class _TaskSimulation:
             is_critical=self.task.is_critical,
         )
         # Once begun, a part that is not preemptible precedes other tasks of equal priority.
-        return *urgency, not is_locked, self.ready_at, self.task.name
+        return *urgency, not is_locked, self._queued_at, self.task.name
 
     def run_step(self, now_ns: int, until_ns: int) -> int:
         """Run the task from `now_ns` to the end of a part or `until_ns`, and return that time."""
@@ -216,6 +222,11 @@ class _TaskSimulation:
             return now_ns
         step = self._steps[0]
         end = min(now_ns + step.time_ns - self._spent_ns, until_ns)
+        if not self.task.priority:
+            end = min(end, now_ns + self._turn_ns)
+            self._turn_ns -= end - now_ns
+            if not self._turn_ns:
+                self._queued_at, self._turn_ns = end, TURN_NS
         if step.unit is not None:
             last = self.spans[-1] if self.spans else None
             if last is not None and (last.unit, last.end_ns, last.release_ns) == (
@@ -260,6 +271,8 @@ class _TaskSimulation:
         """Record the end of the present job and determine the release of the next one."""
         self._ends.setdefault(self._release, now_ns)
         self.ready_at = self._release + self.task.period_ns
+        if self.ready_at > now_ns:
+            self._queued_at, self._turn_ns = self.ready_at, TURN_NS
 
     def list_jobs(self, until_ns: int) -> Iterator[Job]:
         """Yield the jobs released before `until_ns`. Call this when the schedule is complete."""

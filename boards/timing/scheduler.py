@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.words import Scheduler
-from rack.boards.timing.response_time import TURN_NS
 from rack.boards.timing.schedule import simulate_core
-from rack.boards.timing.tasks import Urgency, compute_urgency
+from rack.boards.timing.tasks import TURN_NS, Urgency, compute_urgency
 
 
 @dataclass

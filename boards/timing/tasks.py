@@ -8,6 +8,12 @@ from typing import Any, Literal
 
 from rack.backplane.words import Scheduler
 
+TURN_NS = 4_000_000
+"""Longest time in ns that a task under ordinary scheduling runs while another waits.
+
+One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
+"""
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -76,7 +82,8 @@ class TimedTask:
         role: "executor", "planner" or "clock".
         core: Its core.
         priority: SCHED_FIFO priority. A higher one preempts. Tasks of equal priority run in the
-            order of their releases, then of their names. 0 is ordinary scheduling, below all.
+            order in which they began to wait, then of their names. 0 is ordinary scheduling, below
+            all, in which tasks take turns.
         every_ns: Time between two releases.
         parts: Parts of a job, in order.
         within_cycles: Number of releases that a job may span. The next job is released after them.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -84,6 +85,28 @@ def test_every_job_costs_two_context_switches() -> None:
     assert [job.end_ns for job in chart.list_late_jobs("level.planner")] == [None]
 
 
+def test_ordinary_tasks_take_turns() -> None:
+    tasks = [executor("X5", 20, priority=0, name=name) for name in "ab"]
+    long = [replace(t, parts=(Part(Unit.PROCESS, 10_000_000),), every_ns=40_000_000) for t in tasks]
+    chart = simulate_schedule(long, 40_000_000)
+    spans = [(span.task, span.start_ns // 1_000_000, span.end_ns) for span in chart.spans]
+    assert [(task, start) for task, start, _ in spans] == [
+        *(("a", 0), ("b", 4), ("a", 8), ("b", 12), ("a", 16), ("b", 18))
+    ]
+    assert spans[-1][2] == 20_000_000
+    # Shorter jobs end within their turns.
+    assert row(simulate_schedule(tasks, 20)) == "X" * 10 + "-" * 10
+
+
+def test_a_late_task_keeps_its_place_before_others_of_its_priority() -> None:
+    # It never waits for a release, so SCHED_FIFO does not move it behind the others.
+    chart = simulate_schedule((executor("X6", 5, name="a"), executor("W1", 5, name="b")), 20)
+    assert row(chart) == "X" * 20
+    # A task that has waited in time runs in between.
+    chart = simulate_schedule((executor("X5", 6, name="a"), executor("W2", 5, name="b")), 20)
+    assert row(chart)[:9] == "XXXXXWWXX"
+
+
 def random_tasks(seed: int) -> list[TimedTask]:
     """Return two to five tasks on one core, with room for them or without."""
     chance = random.Random(seed)
@@ -113,6 +136,7 @@ def step_by_step(
     todo: dict[str, list[tuple[str, bool, bool]]] = {task.name: [] for task in tasks}
     release = {task.name: -1 for task in tasks}
     free_from = {task.name: 0 for task in tasks}
+    queued_at = {task.name: 0 for task in tasks}
     late_by = {task.name: 0 for task in tasks}
     row, ends = [], {}
     for now in range(until):
@@ -120,7 +144,7 @@ def step_by_step(
         if not able:
             row.append("-")
             continue
-        task = min(able, key=lambda task: place(task, todo[task.name], free_from[task.name]))
+        task = min(able, key=lambda task: place(task, todo[task.name], queued_at[task.name]))
         name = task.name
         if not todo[name]:
             newest = now - now % task.every_ns
@@ -134,6 +158,8 @@ def step_by_step(
         if not todo[name]:
             ends[name, release[name]] = now + 1
             free_from[name] = release[name] + task.period_ns
+            if free_from[name] > now + 1:
+                queued_at[name] = free_from[name]
     return row, ends
 
 
