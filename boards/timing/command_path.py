@@ -89,8 +89,8 @@ def find_command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPat
     """Return, for each level that an operator can command, its longest path to a lowest level."""
     boxes = {box.name: box for box in layout.mailboxes}
     paths: dict[str, CommandPath] = {}
-    for chain in rack.chains:
-        chain_boxes = find_path_mailboxes(layout, chain)
+    rows = ((chain, row) for chain in rack.chains for row in find_path_mailboxes(layout, chain))
+    for chain, chain_boxes in rows:
         for at, level in enumerate(chain):
             operator = boxes.get(f"{level}.operator")
             levels = chain[at:]

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 from rack.backplane.layout import Layout, TickGrid
 from rack.boards.timing.chains import format_names, list_chains
 from rack.boards.timing.rack import RackTiming, compute_grid_wait
-from rack.boards.timing.system_response import find_mailbox_row
+from rack.boards.timing.system_response import find_mailbox_rows
 
 
 class Station(NamedTuple):
@@ -205,7 +205,7 @@ class JoinedRacks:
         link = self.crossings[writer, chain[near]]
         first = _find_beginning(chain[:near])
         boards = [station.board for station in chain[first:near]]
-        row = find_mailbox_row(self.layouts[writer.rack], boards, [link.mailbox])
+        row, *_ = find_mailbox_rows(self.layouts[writer.rack], boards, [link.mailbox])
         start = near - len(row)
         before = None
         if start == first and first > 0:

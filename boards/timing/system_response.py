@@ -9,6 +9,9 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.queue import is_position_mailbox
 from rack.boards.timing.rack import RackTiming
 
+MailboxRow = tuple[MailboxSpec, ...]
+"""Mailboxes that information passes one after the other."""
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -47,12 +50,15 @@ def predict_response(rack: RackTiming) -> Prediction:
     )
 
 
-def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that carry information along a sequence of boards.
+def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> list[MailboxRow]:
+    """Return the rows of mailboxes that carry information along a sequence of boards.
 
-    The messages of each mailbox are computed from those of the mailbox before it. If no such
-    sequence begins at the first board, the longest one that ends at the last board is returned. It
-    does not contain queues, because their writers determine how long messages wait in them.
+    The messages of each mailbox are computed from those of the mailbox before it. If no row begins
+    at the first board, the longest ones that end at the last board are returned. They do not
+    contain queues, because their writers determine how long messages wait in them.
+
+    Returns:
+        At least one row. All have the same length, which may be 0.
 
     Args:
         layout: Layout of the rack.
@@ -61,24 +67,22 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
     sampled = [
         box for box in layout.mailboxes if box.protocol != "queue" and not is_position_mailbox(box)
     ]
-    return find_mailbox_row(
+    return find_mailbox_rows(
         layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers}
     )
 
 
-def find_mailbox_row(
+def find_mailbox_rows(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
-) -> tuple[MailboxSpec, ...]:
-    """Return the longest sequence of mailboxes, one of each board, that ends in `taken`.
+) -> list[MailboxRow]:
+    """Return the longest rows of mailboxes, one of each board, that end in `taken`.
 
-    The messages of each mailbox are computed from those of the mailbox before it. The sequence ends
-    at the last board. It is shorter than `boards` if none begins at the first board.
+    The messages of each mailbox are computed from those of the mailbox before it. A row ends at the
+    last board. It is shorter than `boards` if none begins at the first board, and may be empty.
     """
-    if not boards:
-        return ()
-    last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
-    return max(
-        ((*find_mailbox_row(layout, boards[:-1], box.rests_on), box) for box in last),
-        key=len,
-        default=(),
-    )
+    last = [box for box in layout.mailboxes if box.writer in boards[-1:] and box.name in taken]
+    rows = [
+        (*row, box) for box in last for row in find_mailbox_rows(layout, boards[:-1], box.rests_on)
+    ]
+    longest = max(map(len, rows), default=0)
+    return [row for row in rows if len(row) == longest] or [()]

@@ -101,15 +101,16 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
 def test_information_is_traced_through_the_sources_of_each_message(jointed: MakeConfig) -> None:
     config = jointed()
     layout = resolve_layout(config)
-    down = find_path_mailboxes(layout, ("path", "joint2", "arm"))
-    assert [box.name for box in down] == ["path.command", "joint2.part"]
-    assert [box.name for box in find_path_mailboxes(layout, ("arm", "joint2", "path"))] == [
-        "arm.status",
-        "joint2.status",
-    ]
+
+    def find_names(*boards: str) -> list[list[str]]:
+        """Return the names of the mailboxes of each row along the boards."""
+        return [[box.name for box in row] for row in find_path_mailboxes(layout, boards)]
+
+    assert find_names("path", "joint2", "arm") == [["path.command", "joint2.part"]]
+    assert find_names("arm", "joint2", "path") == [["arm.status", "joint2.status"]]
     # Of two boards it is the one between them, of one board none.
-    assert [box.name for box in find_path_mailboxes(layout, ("joint2", "arm"))] == ["joint2.part"]
-    assert find_path_mailboxes(layout, ("arm",)) == ()
+    assert find_names("joint2", "arm") == [["joint2.part"]]
+    assert find_names("arm") == [[]]
     assert find_command_paths(build_rack_timing(config, layout), layout)["path"].cycles == (8, 1, 1)
 
 

@@ -139,7 +139,12 @@ def _measure_direction(
             information on.
     """
     layout = recording.layout
-    paths = [(boards, find_path_mailboxes(layout, boards)) for boards in chains]
+    # Paths that end in the same mailbox have the same messages.
+    paths = [
+        (boards, row)
+        for boards in chains
+        for row in {row[-1:]: row for row in find_path_mailboxes(layout, boards)}.values()
+    ]
     entries = read_entries(recording.config)
     imported = {f"{ADAPTER}.{port}" for port in entries.imports} if entries else set[str]()
     if any(boxes and not imported.isdisjoint(boxes[0].rests_on) for _, boxes in paths):
@@ -178,10 +183,14 @@ def measure_joined_responses(
         key = path.direction, path.port, ends, len(path.stations), path.response_ms
         groups.setdefault(key, []).append(path)
     for group in groups.values():
-        boxes = [find_path_mailboxes(recording.layout, (ADAPTER, *each.boards)) for each in group]
+        rows = [
+            (each, row)
+            for each in group
+            for row in find_path_mailboxes(recording.layout, (ADAPTER, *each.boards))
+        ]
         chains = [
             BoardChain((ADAPTER, *each.boards), row, find_origins(recording, each, refine))
-            for each, row in zip(group, boxes, strict=True)
+            for each, row in rows
             if len(row) == len(each.boards)
             and row[0].name == f"{ADAPTER}.{each.port}"
             and {STATUS, *(box.name for box in row)} <= {*recording.mailboxes}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -127,6 +128,34 @@ def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: P
     (row,) = (line for line in found if "760" in line)
     cells = [cell.strip() for cell in row.split("|")[2:5]]
     assert cells == ["760", "1112.5", "fault: mute of upper"]
+
+
+class ForkedRecording(Recording):
+    """A recording whose upper level also writes a mailbox `upper.hint`, a few messages less."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        boxes = self.layout.mailboxes
+        command = self.layout.find_mailbox("upper.command")
+        hint = replace(command, name="upper.hint")
+        self.layout = replace(self.layout, mailboxes=(*boxes, hint))
+
+    @property
+    def mailboxes(self) -> list[str]:
+        return [*super().mailboxes, "upper.hint"]
+
+    def read_signal(self, mailbox: str, field: str) -> np.ndarray:
+        if mailbox != "upper.hint":
+            return super().read_signal(mailbox, field)
+        return np.delete(super().read_signal("upper.command", field), slice(20, 30), axis=0)
+
+
+@pytest.mark.slow
+def test_every_path_between_two_boards_is_measured(folder: Path) -> None:
+    response = measure_system_response(ForkedRecording(folder))
+    assert response is not None
+    assert response["command"]["measured_ms"]["max"] == (45 + 10 * 40) * 2.5
+    assert [beyond["tick"] for beyond in response["command"]["beyond"]] == [19 * 40]
 
 
 @pytest.mark.slow
