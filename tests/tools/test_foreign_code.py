@@ -100,7 +100,7 @@ ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
     ],
     "pause": lambda spied: [(spied.rack,)],
     "resume": lambda spied: [(spied.rack,)],
-    "step": lambda spied: [(spied.lockstep,), (spied.lockstep, "--run")],
+    "step": lambda spied: [(spied.lockstep,)],
     "estop": lambda spied: [(spied.rack,), (spied.rack, "--reset")],
     "clean": lambda spied: [()],
     "replay": lambda spied: [(spied.run, "--out", spied.run / "again.rrd")],

@@ -1,10 +1,9 @@
-"""`rack record`: attach a recorder to a running rack, or to several that work together."""
+"""`rack record`: attach a recorder to a running rack."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from shutil import copyfile
 from threading import Event
@@ -15,7 +14,7 @@ from rack.boards.config.layout import RETAINED_S
 from rack.tools.commands.replay import merge_runs
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, View, check_local_rack_name, option
+from rack.tools.console.parameters import Json, RackName, View, option
 from rack.tools.launch.folder import choose_run_folder
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.current_run import find_run_folder
@@ -40,7 +39,6 @@ CHECK_INTERVAL_S = 0.1
 
 def record(
     rack: RackName,
-    others: list[str] = option("--with RACK", "record this rack as well; repeatable", []),
     out: Path | None = option("--out DIR", "folder of the recording; default: runs/<rack>-<time>"),
     view: View = False,
     save: bool = option(
@@ -54,9 +52,8 @@ def record(
     report`, `rack analyze` and `rack replay` read it. Recording causes no missed deadlines, and the
     run continues when it ends.
 
-    With --with, each rack is recorded into a separate folder DIR/<rack>. When all runs are over,
-    DIR/run.rrd shows them on the time line of the first rack. Record a rack of another machine on
-    that machine, and join the copied folders with `rack replay`.
+    Racks that work together are recorded by a command each, on their machines. `rack replay` joins
+    the folders on one time line.
 
     --save copies what the recorder of `rack run` has recorded so far into a new run folder. Run and
     recording continue.
@@ -66,26 +63,17 @@ def record(
       rack record nasrem
       rack record nasrem --view --out runs/look
       rack record --save nasrem
-      rack record cell-puma --with cell-k1607 --with cell
     """
-    racks = [rack, *others]
-    if others and view:
-        raise Failure(
-            "--view, --with: give one of them: the racks have a common time line only at the end", 2
-        )
-    if save and (others or view):
-        raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
-    with ExitStack() as stack:
-        attached = (closing(Segment.attach(str(check_local_rack_name(name)))) for name in racks)
-        segments = [stack.enter_context(attached_segment) for attached_segment in attached]
-        segment = segments[0]
+    if save and view:
+        raise Failure("--save, --view: give one of them", 2)
+    with closing(Segment.attach(rack)) as segment:
         folder = choose_run_folder(out, rack)
         if save:
             print_answer(*_save_recording(segment, folder), as_json)
             return
         clock_ns = segment.layout.clock_ns
         first_tick = max(0, segment.words[System.TICK] - round(RETAINED_S * 1e9 / clock_ns))
-        notes = _record_racks(segments, folder, view)
+        notes = _record_run(segment, folder, view)
         lasted_s = (segment.words[System.TICK] - first_tick) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
@@ -172,66 +160,19 @@ def _start_recorder(segment: Segment, folder: Path, port: int | None) -> Recorde
     return recorder
 
 
-def _record_racks(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
-    """Record racks until their runs are over.
-
-    Args:
-        racks: One rack, or several, which are then joined on one time line.
-        folder: Run folder of a single rack, or parent of the run folders of several racks.
-        view: True to open the viewer. Only for one rack.
-
-    Returns:
-        Messages for the user.
-    """
-    names = [rack.layout.rack for rack in racks]
-    if duplicates := [name for at, name in enumerate(names) if name in names[:at]]:
-        raise Failure(f"--with {duplicates[0]}: each rack can be recorded only once", 2)
-    folders = [folder / name for name in names] if len(racks) > 1 else [folder]
-    unfinished = ""
-    if len(racks) > 1:
-        unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' creates it"
+def _record_run(segment: Segment, folder: Path, view: bool) -> list[str]:
+    """Record a rack until its run is over or Ctrl-C is pressed. Returns messages for the user."""
+    notes: list[str] = []
     port = find_free_port() if view else None
+    ended = Event()
     # Ctrl-C ends the recording, not the run.
-    with INTERRUPT.stop_orderly(unfinished=unfinished):
-        recorders = []
-        with ExitStack() as stack:
-            for rack, into in zip(racks, folders, strict=True):
-                recorders.append(_start_recorder(rack, into, port))
-                stack.callback(recorders[-1].finish)
+    with INTERRUPT.stop_orderly(ended.set):
+        recorder = _start_recorder(segment, folder, port)
+        try:
             if port is not None:
                 ViewerWindow(format_url(port))
-            notes = _await_runs(racks, recorders, unfinished)
-        if len(racks) == 1:
-            return notes
-        if INTERRUPT.number:
-            return [*notes, unfinished]
-        try:
-            return [*notes, *merge_runs(folders, folder / FILE)]
-        except Failure as failure:
-            raise Failure(
-                f"recorded into {', '.join(map(str, folders))}, but not joined: {failure}"
-            ) from None
-
-
-def _await_runs(
-    racks: Sequence[Segment], recorders: Sequence[RecorderProcess], unfinished: str
-) -> list[str]:
-    """Record until all runs are over or Ctrl-C is pressed, then finish the recordings.
-
-    Args:
-        racks: The racks that are recorded.
-        recorders: Their recorders.
-        unfinished: Message for the user if finishing takes too long after Ctrl-C.
-
-    Returns:
-        Messages of the recorders for the user.
-    """
-    notes: list[str] = []
-    ended = Event()
-    with INTERRUPT.stop_orderly(ended.set, unfinished):
-        while not all(rack.run_is_over for rack in racks) and not ended.wait(CHECK_INTERVAL_S):
-            notes += [text for recorder in recorders for text in recorder.read_notices()]
-    for recorder in recorders:
-        recorder.finish(in_a_hurry=INTERRUPT.number != 0)
-        notes += recorder.read_notices()
-    return notes
+            while not segment.run_is_over and not ended.wait(CHECK_INTERVAL_S):
+                notes += recorder.read_notices()
+        finally:
+            recorder.finish(in_a_hurry=INTERRUPT.number != 0)
+        return [*notes, *recorder.read_notices()]

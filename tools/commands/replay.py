@@ -68,14 +68,13 @@ def replay(
     if out is None and len(runs) == 1 and (recordings := find_viewer_files(runs[0])):
         _open_viewer(*recordings)
         return
-    parts = [part for run in runs for part in _list_runs(run)]
     if out is not None:
-        _write_file(parts, out, place)
-    elif len(parts) == 1 and not (parts[0] / CONFIG).exists():
-        raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
+        _write_file(runs, out, place)
+    elif len(runs) == 1 and not (runs[0] / CONFIG).exists():
+        raise Failure(f"{runs[0]}: nothing to replay: it has no run.rrd", 2)
     elif has_screen():
         with INTERRUPT.raise_interrupted(), TemporaryDirectory(prefix="rack-replay-") as folder:
-            _write_file(parts, Path(folder, "run.rrd"), place)
+            _write_file(runs, Path(folder, "run.rrd"), place)
             _open_viewer(Path(folder, "run.rrd"))
     else:
         raise Failure(
@@ -94,14 +93,6 @@ def find_viewer_files(run: Path) -> list[Path]:
     # A killed recorder leaves a file without a checksum, which cannot be verified.
     checksums.verify(*{part.name for part in files} & {*checksums.stored})
     return files
-
-
-def _list_runs(run: Path) -> list[Path]:
-    """List the runs in a folder of `rack record --with`. For a run, return its folder."""
-    parts = (
-        [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
-    )
-    return parts or [run]
 
 
 def _open_viewer(*recordings: Path) -> None:

@@ -24,9 +24,6 @@ def reproduce(
     only: list[str] = option(
         "--only SECTION", 'only this section, as in 3.4 or "abstract"; repeatable', []
     ),
-    again: bool = option(
-        "--again", "repeat finished experiments, of the sections of --only or of all", False
-    ),
     share: bool = option(
         "--share",
         "run even on cores of another rack's real-time boards, at the price of worse figures",
@@ -52,7 +49,7 @@ def reproduce(
     The experiments take fifteen minutes on two cores. Do not use the machine during this time,
     because other load distorts the real-time figures. Finished experiments are kept, even if the
     command is interrupted or killed; the same command continues. After a change of configs, program
-    or machine the experiments that depend on it are repeated.
+    or machine the experiments that depend on it are repeated. To repeat others, choose another DIR.
 
     Exit status: 0 all experiments were completed, and no claim failed; 1 otherwise; 2 usage error.
 
@@ -60,7 +57,6 @@ def reproduce(
     Examples:
       rack reproduce
       rack reproduce --out paper --only 3.4
-      rack reproduce --only 3.4 --again
       rack reproduce --json | jq .rulings
     """
     if not find_spec("jinja2"):
@@ -76,7 +72,7 @@ def reproduce(
         INTERRUPT.stop_orderly(INTERRUPT.end_process, unfinished=CONTINUE_HINT.format(out)),
         open_progress(as_json) as progress,
     ):
-        page = reproduction.reproduce_paper(wanted, Workshop(out, share), progress, again)
+        page = reproduction.reproduce_paper(wanted, Workshop(out, share), progress)
     is_good = reproduction.has_succeeded(page, wanted)
     document = {"folder": str(out), "worked": is_good, **page.to_document()}
     print_answer(document, reproduction.summarize_page(page, out), as_json)

@@ -18,7 +18,6 @@ def step(
         "--ticks N", "ticks of the clock, instead of cycles", min=1, max=10**9
     ),
     until: str | None = option("--until LEVEL", "hold after the next cycle of this level"),
-    run: bool = option("--run", "let the rack run without holding", False),
     as_json: Json = False,
 ) -> None:
     """Advance a rack in lockstep by single cycles, and show the state of each level.
@@ -26,7 +25,7 @@ def step(
     Start the rack with 'rack run CONFIG --lockstep --step': it is then held before tick 0. A rack
     that already runs in lockstep is held by its first step. Without options the rack advances until
     every level has completed one more cycle. For a level with a state table, the current row is
-    shown as well.
+    shown as well. 'rack resume' lets it run without holding.
 
     Exit status: 0 the steps are done; 1 there is no such rack, it is not in lockstep, or its run
     ended; 2 usage.
@@ -37,17 +36,10 @@ def step(
       rack step nist-state-table 10
       rack step nist-state-table --until task
       rack step nist-state-table --ticks 1
-      rack step nist-state-table --run
     """
     if ticks is not None and (cycles is not None or until is not None):
         raise Failure("--ticks counts ticks, but N and --until count cycles; give one of them", 2)
-    if run and any(value is not None for value in (cycles, ticks, until)):
-        raise Failure("--run lets the rack run without holding; leave out the steps", 2)
     stepper = Stepper(Segment.attach(rack))
-    if run:
-        stepper.release()
-        print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs without holding", as_json)
-        return
     held_tick = stepper.hold_rack()
     end_tick = (
         stepper.find_end_tick(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks

@@ -35,10 +35,6 @@ class Stepper:
             hint = f"end it, and start it with: rack run {segment.rack} --lockstep --step"
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
-    def release(self) -> None:
-        """Let the rack continue without holding it again."""
-        self._words[System.HOLD_AT] = 0
-
     def hold_rack(self) -> int:
         """Hold the rack if it is not held yet. Returns the tick before which it is held."""
         if not self._words[System.HOLD_AT]:
@@ -133,7 +129,7 @@ def resume_rack(segment: Segment) -> list[str]:
     levels: list[str] = []
     if words[System.LOCKSTEP]:
         is_paused = words[System.HOLD_AT] > 0
-        Stepper(segment).release()
+        words[System.HOLD_AT] = 0
     else:
         desk = LevelCommander(segment)
         levels = desk.list_highest_levels("hold")

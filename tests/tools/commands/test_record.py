@@ -123,14 +123,14 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
 def test_an_unrecorded_rack_cannot_be_saved(small: Path, rack_name: str, tmp_path: Path) -> None:
     with Rack(load(small, [f"name={rack_name}"])):
         with pytest.raises(Failure, match=f"--save {rack_name}: the rack is not recorded"):
-            record(rack_name, others=[], out=tmp_path / "saved", save=True)
+            record(rack_name, out=tmp_path / "saved", save=True)
         with pytest.raises(Failure, match="--save, --view: give one of them"):
-            record(rack_name, others=[], out=None, view=True, save=True)
+            record(rack_name, out=None, view=True, save=True)
 
 
 @pytest.mark.slow
-def test_racks_that_work_together_are_recorded_on_one_time_line(
-    rack_name: str, tmp_path: Path
+def test_racks_that_work_together_are_replayed_on_one_time_line(
+    rack_name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [f"{rack_name}-a", f"{rack_name}-b"]
     one, other = configs(ring_texts(names), tmp_path, "adapter.lan.rate_hz=100")
@@ -138,9 +138,12 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
         far.start()
         near.start()
         folder = tmp_path / "run"
-        words = [names[1], "--with", names[0], "--out", str(folder), "--json"]
-        command = [*RACK, "record", *words]
-        with Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as recorder:
+        with ExitStack() as stack:
+            recorders = []
+            for name in names:
+                command = [*RACK, "record", name, "--out", str(folder / name), "--json"]
+                pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": ROOT}
+                recorders.append(stack.enter_context(Popen(command, **pipes)))
             deadline = time.monotonic() + WATCHDOG_S
             while (
                 not all((folder / name / "run.rrd").is_file() for name in names)
@@ -152,9 +155,11 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
             far.stop("recorded")
             while any([near.watch(0.05), far.watch(0.05)]):
                 continue
-            out, err = recorder.communicate(timeout=WATCHDOG_S)
-    assert recorder.returncode == 0, err.decode()
-    (note,) = json.loads(out)["notes"]
+            for recorder in recorders:
+                _, err = recorder.communicate(timeout=WATCHDOG_S)
+                assert recorder.returncode == 0, err.decode()
+    replay([folder / name for name in names[::-1]], folder / "run.rrd", against=None)
+    note = capsys.readouterr().err.splitlines()[-1]
     assert note.startswith(f"rack '{names[0]}' is on the time line of '{names[1]}'")
     for name in names:
         report, _ = write_report(folder / name)
@@ -183,49 +188,39 @@ def kill_thread(pid: int, number: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "count", "send"),
-    [
-        (signal.SIGINT, 1, os.kill),
-        (signal.SIGTERM, 2, os.kill),
-        (signal.SIGHUP, 2, kill_thread),
-    ],
-    ids=["1", "2", "a thread"],
+    ("number", "send"),
+    [(signal.SIGINT, os.kill), (signal.SIGTERM, os.kill), (signal.SIGHUP, kill_thread)],
+    ids=["SIGINT", "SIGTERM", "a thread"],
 )
-def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
+def test_a_signal_ends_a_recording_at_once(
     small: Path,
     rack_name: str,
     tmp_path: Path,
     number: signal.Signals,
-    count: int,
     send: Callable[[int, int], None],
 ) -> None:
-    names, folder = [f"{rack_name}-{nth}" for nth in range(count)], tmp_path / "run"
-    folders = [folder / name for name in names] if count > 1 else [folder]
-    others = [word for name in names[1:] for word in ("--with", name)]
+    folder = tmp_path / "run"
     with ExitStack() as stack:
-        for name in names:
-            config = load(small, [f"name={name}", "clock.mode=realtime"])
-            stack.enter_context(Rack(config)).start()
-        command = [*RACK, "record", names[0], *others, "--out", str(folder), "--json"]
+        config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
+        stack.enter_context(Rack(config)).start()
+        command = [*RACK, "record", rack_name, "--out", str(folder), "--json"]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         recorder = stack.enter_context(Popen(command, cwd=ROOT, **pipes))
         stack.callback(recorder.kill)
-        wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
+        wait_until((folder / "run.rrd").is_file, WATCHDOG_S)
         sent_s = time.monotonic()
         send(recorder.pid, number)
         out, said = recorder.communicate(timeout=WATCHDOG_S)
         took_s = time.monotonic() - sent_s
     assert recorder.returncode == 128 + number, said
-    is_finished = not any((each / "recorder.spool").exists() for each in folders)
-    for each in folders:
-        assert write_report(each)[0]["tasks"]["lower"]["traced"] > 0
+    is_finished = not (folder / "recorder.spool").exists()
+    assert write_report(folder)[0]["tasks"]["lower"]["traced"] > 0
     if not out:
         # On a slow machine the time for an end in order does not suffice.
         assert took_s > interrupt.BOUND_S
         return
-    notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' creates it"] if count > 1 else []
-    assert json.loads(out)["notes"] == notes
-    assert (folder / "run.rrd").exists() == (count == 1)
+    assert json.loads(out)["notes"] == []
+    assert (folder / "run.rrd").exists()
     assert is_finished
 
 
@@ -245,14 +240,6 @@ def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None
             replay(given, file, against=None)
         assert refused.value.status == 2
     assert out.read_bytes() == made
-    # A folder of such runs stands for all of them.
-    replay([tmp_path], tmp_path / "again.rrd", against=None)
-    for name in "ab":
-        lane = f"/{name}/boards/1-pulse/executor"
-        again, first = (
-            read_component(f, lane, "StateChange:state") for f in (tmp_path / "again.rrd", out)
-        )
-        assert again.ticks.tolist() == first.ticks.tolist()
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(Failure, match=r"it has no run\.rrd"):

@@ -10,7 +10,6 @@ from rack.tools.console.answer import Failure, convert_errors, write_file, write
 from rack.tools.console.progress import Progress
 from rack.tools.lab.reproduction.claims import SECTIONS
 from rack.tools.lab.reproduction.experiments.experiment import (
-    RESULTS_FOLDER,
     Experiment,
     StoredResult,
     Workshop,
@@ -54,27 +53,18 @@ def list_experiments(sections: Sections) -> list[Experiment[Any]]:
     return list({each.name: each for claim in claims for each in claim.experiments}.values())
 
 
-def reproduce_paper(
-    wanted: Sections,
-    workshop: Workshop,
-    progress: Progress,
-    again: bool = False,
-) -> Page:
+def reproduce_paper(wanted: Sections, workshop: Workshop, progress: Progress) -> Page:
     """Run the missing experiments of some sections, and write the page of all sections.
 
     Args:
         wanted: Sections whose experiments are run.
         workshop: Folder and settings for the experiments.
         progress: Shows each experiment.
-        again: Whether finished experiments of these sections are repeated.
 
     Returns:
         The page.
     """
     workshop.prepare()
-    if again:
-        for experiment in list_experiments(wanted):
-            (workshop.folder / RESULTS_FOLDER / f"{experiment.name}.json").unlink(missing_ok=True)
     results: dict[str, StoredResult | str] = {
         experiment.name: result
         for experiment in list_experiments(SECTIONS)

@@ -46,7 +46,7 @@ from rack.tools.lab.reproduction.experiments.tasks import (
 from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
 from rack.tools.lab.reproduction.rules import TASK_DONE
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
-from rack.tools.recording.divergence import Difference
+from rack.tools.recording.divergence import DivergentMessage
 from rack.tools.timing.charts.panel import JobCount
 
 CLAIMS = {claim.name: claim for section in SECTIONS for claim in section.claims}
@@ -94,7 +94,7 @@ def rule_on(name: str, *found: Any) -> ClaimVerdict:
 
 def compared(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> Any:
     """Return a run with a digest."""
-    difference = None if differs is None else Difference(differs, "servo.status")
+    difference = None if differs is None else DivergentMessage("servo.status", 1, differs, differs)
     return ComparedRun(mode, digest, miss, difference)
 
 
