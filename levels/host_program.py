@@ -19,8 +19,9 @@ real time never waits for it. It reaches the levels only through a bus adapter
             while self.motion.read().message.done < self.requests.sent:
                 bus.wait(1.0)
 
-The program ends when `run` returns. An exception ends the process, which is restarted by the
-rack's policy with a new object. The serials of its messages continue.
+The program ends when `run` returns, or raises `RunOver` because the end of the run keeps it from
+completing a call. Any other exception ends the process, which is restarted by the rack's policy
+with a new object. The serials of its messages continue.
 
 In real time messages arrive at ticks that depend on the program's timing. A replay with the
 recorded entries repeats a run. In lockstep the program runs while the rack's time stands still,

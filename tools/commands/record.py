@@ -26,7 +26,7 @@ from rack.tools.recording.folder_size import (
     measure_size,
     measure_sizes,
 )
-from rack.tools.recording.recorder.process import RecorderProcess
+from rack.tools.recording.recorder.process import start_recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import EVENTS, rebuild_files
 from rack.tools.recording.spool import STRETCHES, list_stretch_files
@@ -135,31 +135,6 @@ def save_run(folder: Path, into: Path) -> None:
     rebuild_files(into)
 
 
-def _start_recorder(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
-    """Start recording a rack into a folder.
-
-    Args:
-        segment: The rack.
-        folder: Run folder, created if missing.
-        port: Port on which the recorder serves the viewer. None for no viewer.
-
-    Raises:
-        Failure: The folder cannot be written, or the recorder does not start.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONFIG).write_text(segment.config)
-    except OSError as error:
-        if error.filename is not None:
-            raise
-        raise Failure(f"{folder}: {error.strerror}") from None
-    recorder = RecorderProcess(folder)
-    if not recorder.attach(segment.layout.rack, port):
-        recorder.finish()
-        raise Failure(f"{folder}: the recorder has not begun")
-    return recorder
-
-
 def _record_run(segment: Segment, folder: Path, view: bool) -> list[str]:
     """Record a rack until its run is over or Ctrl-C is pressed. Returns messages for the user."""
     notes: list[str] = []
@@ -167,7 +142,7 @@ def _record_run(segment: Segment, folder: Path, view: bool) -> list[str]:
     ended = Event()
     # Ctrl-C ends the recording, not the run.
     with INTERRUPT.stop_orderly(ended.set):
-        recorder = _start_recorder(segment, folder, port)
+        recorder = start_recorder(segment, folder, port)
         try:
             if port is not None:
                 ViewerWindow(format_url(port))

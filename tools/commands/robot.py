@@ -6,7 +6,8 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+import unicodedata
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,12 +16,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from rack.backplane.rack_name import RACK_NAME
 from rack.boards.config import list_names, load
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.tables import format_fitted_records
-from rack.tools.robot.rack_name import derive_name, is_free_name
 
 if TYPE_CHECKING:
     from rack.tools.robot.draft import ArmOptions
@@ -254,3 +255,20 @@ def _format_answer(document: Document, folder: Path, name: str) -> Iterator[str]
     # `rack run NAME` would prefer a file NAME.toml in the current directory.
     is_found = folder == Path(name) and not Path(config_path.name).exists()
     yield f"rack run {name if is_found else shlex.quote(str(config_path))}"
+
+
+def is_free_name(name: str, taken: Container[str]) -> bool:
+    """Return True if a name is valid and not taken."""
+    return re.fullmatch(RACK_NAME, name) is not None and name not in taken
+
+
+def derive_name(text: str, taken: Container[str]) -> str:
+    """Derive a valid name from a text, such as the name of a file.
+
+    Args:
+        text: Any text.
+        taken: Names in use. `-arm` is appended to a derived name that is in use.
+    """
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    name = re.sub("[^a-z0-9_-]+", "-", plain).lstrip("-_")[:40].rstrip("-_") or "arm"
+    return f"{name[:36]}-arm" if name in taken else name

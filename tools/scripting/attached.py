@@ -28,8 +28,7 @@ from rack.tools.monitor import pausing
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.replies import Reply
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot
-from rack.tools.recording.file_names import CONFIG
-from rack.tools.recording.recorder.process import RecorderProcess
+from rack.tools.recording.recorder.process import start_recorder
 from rack.tools.recording.signal import Signal, Trigger, find_mailbox
 
 READ_INTERVAL_S = 0.001
@@ -226,12 +225,8 @@ class AttachedRack:
         """
         wanted = None if folder is None else Path(folder)
         path = choose_run_folder(wanted, self._segment.rack)
-        path.mkdir(parents=True, exist_ok=True)
-        (path / CONFIG).write_text(self._segment.config)
-        recorder = RecorderProcess(path)
+        recorder = start_recorder(self._segment, path, words=self._segment.words)
         self._closing.callback(recorder.finish)
-        if not recorder.attach(self._segment.rack, None, self._segment.words):
-            raise Failure(f"{path}: the recorder has not begun")
         return path
 
 

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+import tomli_w
+
 from rack.boards import Rack as CrateRack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError, Mistake
 from rack.boards.events import Event
 from rack.tools.launch.folder import EventLog, choose_run_folder
 from rack.tools.launch.launch import NO_RECORDER, build_result, compare_recording, create_run_folder
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.holds import StandstillDetector
 from rack.tools.recording.recorder.process import RecorderProcess
-from rack.tools.scripting.settings import list_settings
 
 
 class LaunchedRack(CrateRack):
@@ -145,3 +148,37 @@ class LaunchedRack(CrateRack):
 
 Rack = LaunchedRack
 """The name of the class in the package `rack`."""
+
+
+def list_settings(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
+    """Convert tables of Python values to settings, in the form that --set takes.
+
+    Args:
+        tables: Dictionary from key to value. Keys may be dotted, and values may be tables.
+        outer: Dotted prefix of all keys.
+
+    Raises:
+        ConfigError: TOML cannot express a value.
+    """
+    for key, value in tables.items():
+        if isinstance(value, Mapping) and value:
+            yield from list_settings(value, f"{outer}{key}.")
+        else:
+            try:
+                yield f"{outer}{key}={_format_inline(value)}"
+            except TypeError as error:
+                raise ConfigError([Mistake("settings", f"{outer}{key}", str(error))]) from None
+
+
+def _format_inline(value: Any) -> str:
+    """Format a Python value as TOML on one line. Arrays become lists, paths become strings."""
+    if isinstance(value, Mapping):
+        items = (
+            f"{_format_inline(str(key))} = {_format_inline(item)}" for key, item in value.items()
+        )
+        return f"{{{', '.join(items)}}}"
+    if isinstance(value, np.ndarray | list | tuple):
+        return f"[{', '.join(map(_format_inline, value))}]"
+    plain = str(value) if isinstance(value, Path) else value
+    plain = plain.item() if isinstance(plain, np.generic) else plain
+    return tomli_w.dumps({"value": plain}).partition("=")[2].strip()

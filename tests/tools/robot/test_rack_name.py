@@ -6,7 +6,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from rack.boards.config.schema import RackName
-from rack.tools.robot.rack_name import derive_name, is_free_name
+from rack.tools.commands.robot import derive_name, is_free_name
 
 TAKEN = ("nasrem",)
 DERIVED = {

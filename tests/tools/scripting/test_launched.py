@@ -23,7 +23,7 @@ from rack.boards.events import Event
 from rack.tools.recording.recorder import process as recorder_process
 from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
-from rack.tools.scripting.settings import list_settings
+from rack.tools.scripting.launched import list_settings
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S
 

@@ -17,8 +17,10 @@ from typing import Any
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED_STATES, read_processor_ns, read_state, wait_readable
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
+from rack.tools.recording.file_names import CONFIG
 
 VIEW_CLASS = "rack.tools.viewer.sink:ViewSink"
 """Class that writes the viewer's file.
@@ -85,6 +87,34 @@ class IdleCounter:
         self._count = self._count + 1 if used_ns == self._used_ns else 0
         self._used_ns = used_ns
         return self._count
+
+
+def start_recorder(
+    segment: Segment, folder: Path, port: int | None = None, words: memoryview | None = None
+) -> RecorderProcess:
+    """Start recording a running rack into a folder.
+
+    Args:
+        segment: Segment of the rack.
+        folder: Run folder, created if missing.
+        port: As in `RecorderProcess.attach`.
+        words: As in `RecorderProcess.attach`.
+
+    Raises:
+        Failure: The folder cannot be written, or the recorder does not start.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CONFIG).write_text(segment.config)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise Failure(f"{folder}: {error.strerror}") from None
+    recorder = RecorderProcess(folder)
+    if not recorder.attach(segment.layout.rack, port, words):
+        recorder.finish()
+        raise Failure(f"{folder}: the recorder has not begun")
+    return recorder
 
 
 class RecorderProcess:
