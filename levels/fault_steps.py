@@ -41,6 +41,11 @@ class Fault(NamedTuple):
         """Index of the joint that the fault affects. -1 for all joints."""
         return int(self.parameters.get("joint", -1))
 
+    def mark_joints(self, count: int) -> NDArray[np.bool_]:
+        """Return a mask of the affected joints of a device with `count` joints."""
+        joints = np.arange(count)
+        return np.asarray((joints == self.joint) | (self.joint < 0))
+
 
 @dataclass(frozen=True)
 class ActiveFault:

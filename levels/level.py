@@ -92,7 +92,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType, ModuleType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from pydantic import ValidationError, model_validator
 
@@ -162,6 +162,40 @@ Mismatches = Iterable[tuple[str, Any, str]]
 """Key, value and reason of each table entry that is inconsistent with something else."""
 
 
+P = TypeVar("P")
+
+
+def read_program(
+    validate: Callable[[Mapping[str, Any]], P],
+    table: Mapping[str, Any],
+    find_mismatches: Callable[[P], Mismatches],
+    place: str = "",
+) -> P:
+    """Return a valid program, or a part of one.
+
+    Args:
+        validate: Converts the table with pydantic.
+        table: The program as a table.
+        find_mismatches: Returns the inconsistencies of the program with arm or scene.
+        place: Prefix of the keys in the error text.
+
+    Raises:
+        ProgramError: The program is invalid. The text has one line per mistake.
+    """
+    try:
+        program = validate(table)
+    except ValidationError as error:
+        mistakes = [
+            f"{place}{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()
+        ]
+        raise ProgramError("\n".join(mistakes)) from error
+    if mistakes := [
+        f"{place}{key} = {value!r}: {why}" for key, value, why in find_mismatches(program)
+    ]:
+        raise ProgramError("\n".join(mistakes))
+    return program
+
+
 class Program(Table):
     """Base class for the record of a level that reads a program from `[task]`."""
 
@@ -191,21 +225,12 @@ class Program(Table):
         Raises:
             ProgramError: The program is invalid. The text has one line per mistake.
         """
-        try:
-            program = cls.model_validate(table)
-        except ValidationError as error:
-            raise ProgramError(
-                "\n".join(
-                    f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}"
-                    for entry in error.errors()
-                )
-            ) from error
-        if misfits := [
-            f"task.{key} = {value!r}: {why}"
-            for key, value, why in program.find_mismatches(robot, scene)
-        ]:
-            raise ProgramError("\n".join(misfits))
-        return program
+        return read_program(
+            cls.model_validate,
+            table,
+            lambda program: program.find_mismatches(robot, scene),
+            "task.",
+        )
 
     def list_goals(self) -> Iterable[GoalConfig]:
         """Yield the final positions of the objects, in the order of the program.

@@ -21,6 +21,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    StringConstraints,
     ValidationError,
     field_validator,
     model_validator,
@@ -29,6 +30,7 @@ from pydantic.config import JsonDict
 from pydantic.fields import FieldInfo
 
 from rack.backplane.bounded_toml import load_toml
+from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import LevelError
 from rack.levels.references import find_class
 
@@ -45,6 +47,10 @@ Positive = Annotated[float, Field(gt=0, lt=MAX_VALUE, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+Quaternion = tuple[Finite, Finite, Finite, Finite]
+RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
+MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
+ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 Interface = Literal["torque", "position", "velocity"]
 """Commands that drives accept.
 
@@ -60,6 +66,13 @@ Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
 LIVE: JsonDict = {"live": True}
 Live = Annotated[T, Field(json_schema_extra=LIVE)]
 """Field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
+
+
+def to_tuple(value: Any) -> Any:
+    """Convert one name or table, or a list of them, to a tuple. Return other values unchanged."""
+    if isinstance(value, str | Mapping):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
 
 
 class Table(BaseModel):
@@ -128,12 +141,14 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
     try:
         return kind(**params)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(key_part) for key_part in first["loc"])
         valid = ", ".join(kind.model_fields)
-        raise LevelError(
-            f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}"
-        ) from error
+        raise LevelError(f"params.{describe_first_error(error)}; keys: {valid}") from error
+
+
+def describe_first_error(error: ValidationError) -> str:
+    """Return the key, the value and the reason of the first mistake that pydantic has found."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))} = {first['input']!r}: {first['msg'].lower()}"
 
 
 def list_live_keys(kind: type[Table] | None) -> tuple[str, ...]:
@@ -335,7 +350,7 @@ class ToolConfig(Table):
 
     position: Vector = (0.0, 0.0, 0.0)
     """of the tool in the body's frame [m]"""
-    quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """of the tool in the body's frame, as w, x, y, z; its z axis is the direction of approach"""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import StringConstraints
 
 from rack.levels.operator import MAX_NAME_BYTES, Goal, Operation
-from rack.levels.tables import Finite, Moment, Table, Tick, Vector
+from rack.levels.tables import Finite, Moment, Quaternion, Table, Tick, Vector
 
 
 class CommandConfig(Table):
@@ -45,7 +45,7 @@ class CommandConfig(Table):
     """goal: one position per joint [rad]"""
     position: Vector | None = None
     """goal: tool position [m]; needs quaternion or direction"""
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
+    quaternion: Quaternion | None = None
     """goal: tool orientation as w, x, y, z"""
     direction: Vector | None = None
     """goal: direction of the tool's z axis, with any rotation about it; default: down"""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, StringConstraints
+from pydantic import Field
 
 from rack.backplane.layout import Protocol, Sampled
-from rack.levels.tables import Table
+from rack.levels.tables import MailboxName, Table
 
-MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Microseconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 UNREAD = 32
 """Default for the largest number of unread messages in a queue."""

@@ -11,14 +11,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, StringConstraints, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.layout import Role, TaskSpec, Wake
-from rack.backplane.rack_name import RACK_NAME
 from rack.boards.config.command import CommandConfig
 from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
-from rack.boards.config.protocols import MailboxName, ProtocolConfig
+from rack.boards.config.protocols import ProtocolConfig
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.times import (
     SHORTEST_MS,
@@ -31,10 +30,14 @@ from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
 from rack.levels.tables import (
+    ClassName,
+    MailboxName,
     Positive,
+    RackName,
     RobotConfig,
     SceneConfig,
     Table,
+    to_tuple,
 )
 
 CLOCK_SLOT = 1
@@ -50,18 +53,9 @@ Mode = Literal["realtime", "lockstep"]
 OnLoss = Literal["hold", "stop", "brake"]
 
 
-def _to_tuple(value: Any) -> Any:
-    """Convert one name or table, or a list of them, to a tuple. Return other values unchanged."""
-    if isinstance(value, str | Mapping):
-        return (value,)
-    return tuple(value) if isinstance(value, list) else value
-
-
-RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
-ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
-Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(_to_tuple)]
-Neighbours = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
-Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_to_tuple)]
+Standbys = Annotated[tuple["StandbyConfig", ...], BeforeValidator(to_tuple)]
+Neighbours = Annotated[tuple[str, ...], BeforeValidator(to_tuple)]
+Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(to_tuple)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]

@@ -10,7 +10,7 @@ from pydantic import Field, StringConstraints
 from rack.backplane.message import Message
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.references import import_reference
-from rack.levels.tables import Positive, Table
+from rack.levels.tables import ClassName, MailboxName, Positive, RackName, Table
 
 FASTEST_HZ = 50.0
 """Highest rate of an exchange over a network."""
@@ -18,13 +18,10 @@ MAX_CHAIN_BYTES = 8192
 """Maximum size in bytes of a rack's certificates in DER form. They are sent with every seal."""
 MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
-PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
-Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Remote = Annotated[
     str, StringConstraints(pattern=rf"^{RACK_NAME}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
 ]
-TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 ENDPOINT_NOTE = (
     "as in tls/192.168.1.5:7447, or on one machine unix/cell: a socket that only this user reaches"
 )
@@ -47,7 +44,7 @@ class CredentialError(Exception):
 class ExportConfig(Table):
     """`[adapter.lan.export.<port>]`: one mailbox of this rack that others may import."""
 
-    source: Local = Field(alias="from")
+    source: MailboxName = Field(alias="from")
     """mailbox, as in task.status; others import it as RACK/task.status"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
     """rate of the exchange [Hz]; divides the adapter's"""
@@ -58,7 +55,7 @@ class ImportConfig(Table):
 
     source: Remote = Field(alias="from")
     """rack and mailbox, as in cell/task.orders"""
-    type: TypeName
+    type: ClassName
     """message class of that mailbox, package.module:Class"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
     """rate of the exchange [Hz]; divides the adapter's"""
@@ -112,7 +109,7 @@ class LanTable(Table):
     """reaction to the loss of a peer; hold: levels find its mailboxes lost at once and hold until
     its next message; stop: in addition, the arm ramps to rest and brakes until the peer is back;
     go on: levels keep its last message, however old"""
-    peers: tuple[PeerName, ...] = ()
+    peers: tuple[RackName, ...] = ()
     """racks with which this one works, besides the ones from which it imports; they may import, and
     lockstep waits for them"""
     launch: tuple[str, ...] = ()
@@ -120,7 +117,7 @@ class LanTable(Table):
     partners: tuple[str, ...] = ()
     """configs of racks with which `rack check` and reports join this one's timing, besides those in
     launch"""
-    estop_from: tuple[PeerName, ...] = ()
+    estop_from: tuple[RackName, ...] = ()
     """names, proved by certificates, that may set the emergency stop from another machine, with
     rack estop HOST/RACK"""
     exports: dict[PortName, ExportConfig] = Field({}, alias="export")

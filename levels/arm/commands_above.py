@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 
-from rack.levels.level import LevelContext, Reading, Verdict
+from rack.levels.level import LevelContext, Mismatches, Reading, Verdict
 from rack.levels.operator import SampledCommand
 from rack.levels.robot.limits import MotorPatience
+
+
+def check_commanders(context: LevelContext, wanted: Mapping[str, Collection[str]]) -> Mismatches:
+    """Report each joint that is not commanded by exactly one board above.
+
+    Args:
+        context: The level that reads the commands.
+        wanted: Joints that each board commands.
+    """
+    for joint in context.robot.joints:
+        boards = [board for board, joints in wanted.items() if joint in joints]
+        if len(boards) != 1:
+            why = f"joint '{joint}' must be commanded by one board; {describe_commanders(boards)}"
+            yield "above", [*wanted], why
+
+
+def describe_commanders(boards: Iterable[str]) -> str:
+    """Return a text with the boards that command a joint or the gripper."""
+    named = ", ".join(f"'{board}'" for board in boards)
+    return f"it is commanded by {named or 'none'}"
 
 
 class CommandsAbove:

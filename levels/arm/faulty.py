@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rack.levels.algebra import Array, Mask
+from rack.levels.algebra import Array
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.link import JointTarget, Link, Sensed
 from rack.levels.fault_steps import ActiveFault, CommandStep, Key, MotorStep, SensorStep
@@ -72,7 +72,7 @@ class FaultyLink:
         active = [
             ActiveFault(place, fault, joints, self._arm.every, self._first_samples)
             for place, fault in enumerate(faults)
-            if (joints := self._mark_joints(fault)).any()
+            if (joints := fault.mark_joints(len(self._limits))).any()
         ]
         for gone in self._first_samples.keys() - {a.key for a in active}:
             del self._first_samples[gone]
@@ -84,11 +84,6 @@ class FaultyLink:
         for fraction, weak in self._motors:
             np.minimum(max_torque, fraction * self._limits, out=max_torque, where=weak.joints)
         self._arm.weaken(max_torque if self._motors else None)
-
-    def _mark_joints(self, fault: Fault) -> Mask:
-        """Return a mask of the joints that a fault affects, (joints,)."""
-        joints = np.arange(len(self._limits))
-        return np.asarray((joints == fault.joint) | (fault.joint < 0))
 
     def sense(self) -> Sensed:
         """Return the newest sample with the faults applied."""

@@ -179,13 +179,7 @@ class InverseKinematics:
         Returns:
             Distance, m, then rotation, rad, (6,).
         """
-        tool = self.compute_tool_pose(q)
-        turn = np.zeros(3)
-        error = np.zeros(6)
-        error[:3] = target.position - tool.position
-        mujoco.mju_subQuat(turn, target.quaternion, tool.quaternion)
-        mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
-        return error
+        return self.compute_tool_pose(q).compute_error(target)
 
     def _compute_step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
         """Return the bounded step that best reduces the error.

@@ -144,9 +144,8 @@ class Payloads:
         """
         cell = self._cell
         data = self._data
-        address = cell.object_qpos[row]
         tool = make_pose(*read_site_pose(data, cell.tool))
-        data.qpos[address : address + 7] = np.concatenate(tool @ grip)
+        data.qpos[cell.find_pose(row)] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
         parts = cell.list_geoms(row)
         return sum(
@@ -291,8 +290,7 @@ class FixedJaw:
                 break
         if travel > SEARCH_RANGE_M:
             return tool
-        across = np.zeros(3)
-        mujoco.mju_rotVecQuat(across, np.array([0.0, self._side, 0.0]), tool.quaternion)
+        across = tool.rotate((0.0, self._side, 0.0))
         return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
     def _measure_distance(self, row: int, at: Pose) -> float:
@@ -304,8 +302,7 @@ class FixedJaw:
         """
         model = self._cell.model
         data = self._data
-        address = self._cell.object_qpos[row]
-        data.qpos[address : address + 7] = np.concatenate(at)
+        data.qpos[self._cell.find_pose(row)] = np.concatenate(at)
         mujoco.mj_kinematics(model, data)
         distances = [
             mujoco.mj_geomDistance(model, data, int(part), int(geom), SEARCH_RANGE_M, None)

@@ -108,6 +108,11 @@ class Cell:
         mujoco.mj_forward(self.model, data)
         return data
 
+    def find_pose(self, row: int) -> slice:
+        """Return where the pose of an object is in the coordinates, given its index in `bodies`."""
+        address = self.object_qpos[row]
+        return slice(address, address + 7)
+
     def list_geoms(self, row: int) -> Ints:
         """Return the ids of the geoms of an object or obstacle, given its index in `bodies`."""
         model = self.model

@@ -104,9 +104,7 @@ def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
 
 def is_leaning(tool: Pose) -> bool:
     """Return True if a tool does not point straight down."""
-    axis = np.zeros(3)
-    mujoco.mju_rotVecQuat(axis, UP, tool.quaternion)
-    return bool(1.0 + axis[2] > MIN_LEAN)
+    return bool(1.0 + tool.rotate(UP)[2] > MIN_LEAN)
 
 
 def compute_bearing(cell: Cell, position: Array) -> float:

@@ -8,7 +8,16 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from rack.levels.level import Mismatches, Program
-from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
+from rack.levels.tables import (
+    Finite,
+    GoalConfig,
+    Positive,
+    Quaternion,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    Vector,
+)
 
 ROUNDING_S = 1e-9
 """Tolerance of comparisons with deadlines in s, as ticks times the clock's period are rounded."""
@@ -48,7 +57,7 @@ class Goto(Action):
     """the kind of action"""
     position: Vector | None = None
     """of the tool [m]"""
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
+    quaternion: Quaternion | None = None
     """of the tool, as w, x, y, z"""
     direction: Vector | Literal["any"] | None = None
     """of the tool's z axis, with any turn about it; default: down; with 'any' the orientation is

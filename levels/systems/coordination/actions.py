@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from rack.levels.errors import ProgramError
-from rack.levels.level import LevelContext
+from rack.levels.level import LevelContext, read_program
 from rack.levels.operator import Goal
 from rack.levels.systems.coordination.messages import CellAction, OrderAction
 from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, find_mismatches
@@ -58,19 +58,11 @@ def read_action(message: CellAction, context: LevelContext) -> AnyAction:
     Raises:
         ProgramError: The action is malformed, or does not suit the arm or the scene.
     """
-    try:
-        action: AnyAction = _ACTION.validate_python(
-            {**_to_table(message), "by": message.by or None}
-        )
-    except ValidationError as error:
-        lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
-        raise ProgramError("\n".join(lines)) from error
-    if mistakes := [
-        f"{key} = {value!r}: {why}"
-        for key, value, why in find_mismatches(action, context.robot, context.scene)
-    ]:
-        raise ProgramError("\n".join(mistakes))
-    return action
+    return read_program(
+        _ACTION.validate_python,
+        {**_to_table(message), "by": message.by or None},
+        lambda action: find_mismatches(action, context.robot, context.scene),
+    )
 
 
 def _to_table(message: CellAction) -> dict[str, Any]:

@@ -32,11 +32,17 @@ from rack.levels.systems.coordination.messages import (
     CellOrder,
     CellProgress,
     CellReport,
-    MailboxName,
     OrderVerb,
     Phase,
 )
-from rack.levels.tables import Positive, RobotConfig, SceneConfig, Table, read_params
+from rack.levels.tables import (
+    MailboxName,
+    Positive,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    read_params,
+)
 from rack.levels.task.program import Goto, Home, Transfer
 
 MAX_STEPS = 1000

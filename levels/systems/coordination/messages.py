@@ -8,16 +8,13 @@ ones.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Annotated
 
 from numpy import ndarray
-from pydantic import StringConstraints
 
 from rack.backplane.message import Command, Message, Status, field, integer_field
 from rack.levels.messages import OPERATED, Error, joint_field
 from rack.levels.operator import MAX_JOINTS, Goal
 
-MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 OBJECT_BYTES = 32
 """Longest name of an object in an order."""
 

@@ -23,10 +23,9 @@ from rack.levels.systems.coordination.messages import (
     CellOrder,
     CellReport,
     CellRequest,
-    MailboxName,
     Response,
 )
-from rack.levels.tables import Positive
+from rack.levels.tables import MailboxName, Positive
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.planner import TaskPlanner
 from rack.levels.task.program import AnyAction, TaskConfig, TaskParams

@@ -36,7 +36,15 @@ from rack.levels.systems.force.contact import (
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
-from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, Vector
+from rack.levels.tables import (
+    Finite,
+    Positive,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    Vector,
+    describe_first_error,
+)
 
 SIGN_S = 0.1
 """Simulated time between signs of life."""
@@ -251,11 +259,7 @@ class ForceMotions(Motions):
         try:
             changed = ContactConfig(**{**contact.model_dump(), **changes})
         except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(map(str, first["loc"]))
-            raise LevelError(
-                f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
-            ) from error
+            raise LevelError(f"{call}: {describe_first_error(error)}") from error
         if reason := self._program.find_contact_error(changed, self._robot):
             raise LevelError(f"{call}: contact '{name}': {reason}")
         return self._program.build_contact(changed)

@@ -181,14 +181,8 @@ class HybridLaw:
         """Return the joint velocities that follow the motion and the wanted force, in rad/s."""
         self._there.evaluate_at(motion.position + self._base, motion.velocity)
         self._here.evaluate_at(motion.position + self._away, motion.velocity + self._speed)
-        motion_pose = self._there.pose
-        present_pose = self._here.pose
-        turn = np.zeros(3)
-        error = np.zeros(AXES)
-        error[:3] = motion_pose.position - present_pose.position
+        error = self._here.pose.compute_error(self._there.pose)
         self.offset[:] = -error[:3]
-        mujoco.mju_subQuat(turn, motion_pose.quaternion, present_pose.quaternion)
-        mujoco.mju_rotVecQuat(error[3:], turn, present_pose.quaternion)
         wanted = mat_vec(self._there.jacobian, motion.velocity) + CATCH_UP * error
         twist = rotate_halves(task.rotation.T, wanted)
         forced = np.zeros(AXES)

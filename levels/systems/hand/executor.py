@@ -11,7 +11,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
 from rack.levels.arm import substeps
-from rack.levels.arm.commands_above import CommandsAbove
+from rack.levels.arm.commands_above import CommandsAbove, check_commanders
 from rack.levels.fault_steps import TendonStep
 from rack.levels.level import (
     OPERATOR,
@@ -83,31 +83,25 @@ class HandExecutor(Executor):
         """Report a missing `[robot.hand]` and joints not driven by exactly one board above."""
         hand = context.robot.hand
         if hand is None:
-            yield (
-                "executor",
-                cls.__name__,
-                "this board drives a hand; [robot.hand] is missing",
-            )
+            why = "this board drives a hand; [robot.hand] is missing"
+            yield "executor", cls.__name__, why
             return
-        owners = {joint: finger.name for finger in hand.finger for joint in finger.joints}
-        for joint in context.robot.joints:
-            boards = [
-                board
+        joints: dict[str | None, Sequence[str]] = {one.name: one.joints for one in hand.finger}
+        joints[None] = context.robot.joints
+        yield from check_commanders(
+            context,
+            {
+                board: joints.get(pace.params.get("finger"), ())
                 for board, pace in context.above.items()
-                if pace.params.get("finger", owners[joint]) == owners[joint]
-            ]
-            if len(boards) != 1:
-                by = ", ".join(f"'{board}'" for board in boards) or "none"
-                why = f"joint '{joint}' must be commanded by one board; it is commanded by {by}"
-                yield "above", [*context.above], why
+            },
+        )
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Tear the tendons in `faults` and mend all others. Unknown joints are ignored."""
-        joints = np.arange(len(self.hand.hand.arms))
-        torn = np.zeros((2, len(joints)), dtype=bool)
+        torn = np.zeros(self.wanted_tensions.tension.shape, dtype=bool)
         self._torn = {}
         for place, fault in enumerate(faults):
-            struck = (fault.joint < 0) | (joints == fault.joint)
+            struck = fault.mark_joints(torn.shape[1])
             torn[int(fault.parameters["side"])] |= struck
             if struck.any():
                 self._torn[place] = True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 
 from rack.backplane.message import State
@@ -260,9 +259,7 @@ class GraspExecutor(Executor):
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):
-            turned = np.zeros(3)
-            mujoco.mju_rotVecQuat(turned, np.array(step.by), self._from_world.quaternion)
-            return step.model_copy(update={"by": tuple(turned)})
+            return step.model_copy(update={"by": tuple(self._from_world.rotate(step.by))})
         if not plan.id:
             return step
         if isinstance(step, CloseStep):

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.words import Block
-from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
+from rack.levels.algebra import Array, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram, HostSender, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext
@@ -108,8 +108,7 @@ class GraspPlanner:
             position: Position of the object in the world, (3,), m.
             quaternion: Orientation of the object in the world, (4,), w first.
         """
-        address = self._cell.object_qpos[row]
-        self._data.qpos[address : address + 7] = *position, *quaternion
+        self._data.qpos[self._cell.find_pose(row)] = *position, *quaternion
         self._data.qpos[self._cell.qpos] = self._cell.home
         mujoco.mj_kinematics(self._cell.model, self._data)
         lines = (
@@ -170,7 +169,7 @@ class GraspPlanner:
         centre = centre + float(((base - centre) * along).sum()) * along
         start = centre - OUTSIDE_M * way
         nearest = math.inf
-        for geom in self._list_object_geoms(row):
+        for geom in self._cell.list_geoms(row):
             if not model.geom_contype[geom]:
                 continue
             size = model.geom_size[geom]
@@ -181,10 +180,6 @@ class GraspPlanner:
             if 0.0 <= distance < nearest:
                 nearest = distance
         return None if nearest > OUTSIDE_M else start + nearest * way
-
-    def _list_object_geoms(self, row: int) -> Ints:
-        """Return the indices of the object's geoms."""
-        return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
     def _find_joints(self, tips: Array, start: Array) -> Array | None:
         """Return joint positions, (joints,), in rad, for given tip positions.
@@ -227,7 +222,7 @@ class GraspPlanner:
         """
         model = self._cell.model
         body = self._cell.bodies[row]
-        friction = float(model.geom_friction[self._list_object_geoms(row), 0].max())
+        friction = float(model.geom_friction[self._cell.list_geoms(row), 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
         load = self._rules.reserve * (weight + self._rules.pull)
         return load / (2.0 * friction * (len(self._bases) - 1))

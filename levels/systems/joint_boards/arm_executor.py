@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.arm.commands_above import CommandsAbove
+from rack.levels.arm.commands_above import CommandsAbove, check_commanders, describe_commanders
 from rack.levels.level import OPERATOR, Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVE_OPERATIONS, HOLD_COMMANDS, OperatorCommand
@@ -111,15 +111,7 @@ class ArmExecutor(ArmDriver):
         wanted = {
             board: pace.params.get("joints", everything) for board, pace in context.above.items()
         }
-        for joint in everything:
-            boards = [board for board, joints in wanted.items() if joint in joints]
-            if len(boards) != 1:
-                yield (
-                    "above",
-                    list(wanted),
-                    f"joint '{joint}' must be commanded by one board; "
-                    f"{_describe_commanders(boards)}",
-                )
+        yield from check_commanders(context, wanted)
         grips = [
             board for board, pace in context.above.items() if pace.params.get("gripper", False)
         ]
@@ -127,7 +119,7 @@ class ArmExecutor(ArmDriver):
             text = "the gripper must be commanded by one board"
             if context.robot.gripper is None:
                 text = "the arm has no gripper"
-            yield "above", list(wanted), f"{text}; {_describe_commanders(grips)}"
+            yield "above", list(wanted), f"{text}; {describe_commanders(grips)}"
 
     def process(self, tick: int) -> None:
         """Run the cycle of an arm, and write its tick to the status."""
@@ -220,9 +212,3 @@ class ArmExecutor(ArmDriver):
         holding = self.abandoned or not self.joints.moves
         stopped = self.abandoned or reaction > 0 or is_held
         return SetPointStatus(0, holding, stopped, 0, reason, has_work=True)
-
-
-def _describe_commanders(boards: Sequence[str]) -> str:
-    """Return a text with the boards that command a joint or the gripper."""
-    named = ", ".join(f"'{board}'" for board in boards)
-    return f"it is commanded by {named or 'none'}"

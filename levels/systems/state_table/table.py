@@ -42,7 +42,7 @@ from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import REASON_BYTES, State
 from rack.backplane.regular_file import read_regular_file
 from rack.levels.errors import LevelError
-from rack.levels.tables import Positive, Table, Vector
+from rack.levels.tables import Positive, Table, Vector, to_tuple
 
 MAX_NAME_BYTES = 24
 """Maximum length of a word, a state's name or a table's name."""
@@ -131,16 +131,9 @@ RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{MAX_ROW_NAME_BY
 Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$")]
 
 
-def _to_tuple(value: Any) -> Any:
-    """Convert a single word to a tuple of one word, and a list to an immutable tuple."""
-    if isinstance(value, str):
-        return (value,)
-    return tuple(value) if isinstance(value, list) else value
-
-
-Words = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
-States = Annotated[tuple[Name, ...], BeforeValidator(_to_tuple)]
-Place = Annotated[Vector, BeforeValidator(_to_tuple)]
+Words = Annotated[tuple[str, ...], BeforeValidator(to_tuple)]
+States = Annotated[tuple[Name, ...], BeforeValidator(to_tuple)]
+Place = Annotated[Vector, BeforeValidator(to_tuple)]
 
 
 SAME = "same"

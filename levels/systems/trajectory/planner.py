@@ -39,6 +39,7 @@ from rack.levels.tables import (
     Finite,
     NotNegative,
     Positive,
+    Quaternion,
     RobotConfig,
     SceneConfig,
     Table,
@@ -46,8 +47,6 @@ from rack.levels.tables import (
 )
 
 MAX_REQUESTS = 200
-
-Turn = tuple[Finite, Finite, Finite, Finite]
 
 
 class MotionStep(Table):
@@ -75,7 +74,7 @@ class MoveStep(MotionStep):
     """joint positions [rad]"""
     position: Vector | None = None
     """position of the tool [m]"""
-    quaternion: Turn | None = None
+    quaternion: Quaternion | None = None
     """orientation of the tool, as w, x, y, z; by default as at home"""
 
     @model_validator(mode="after")
@@ -98,7 +97,7 @@ class LineStep(MotionStep):
     """the kind of step"""
     position: Vector
     """position of the tool [m], in the frame of `body`"""
-    quaternion: Turn | None = None
+    quaternion: Quaternion | None = None
     """orientation of the tool in the same frame, as w, x, y, z; by default as at home"""
     body: str | None = None
     """object or obstacle in whose frame the goal is; by default the world"""
