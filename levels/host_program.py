@@ -33,14 +33,13 @@ elsewhere for 30 s ends the run. Lockstep does not wait for interactive prompts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext, Program
-from rack.levels.ports import InputPort, M, WrittenPort, collect_ports
-from rack.levels.tables import Table
+from rack.levels.level import LevelContext, PortOwner
+from rack.levels.ports import InputPort, M, WrittenPort
 
 M_co = TypeVar("M_co", bound=Message, covariant=True)
 
@@ -162,25 +161,11 @@ class ProgramOutput(WrittenPort[M, HostSender[M]]):
     """
 
 
-class HostProgram:
+class HostProgram(PortOwner):
     """A program of a host board. It has no rate, so `context.every` is 1."""
-
-    inputs: ClassVar[Mapping[str, ProgramInput[Any]]] = {}
-    """The ports that it reads, by name, collected from the class and its bases."""
-    outputs: ClassVar[Mapping[str, ProgramOutput[Any]]] = {}
-    """The ports that it writes, by name, collected in the same way."""
-    params: ClassVar[type[Table] | None] = None
-    """Keys of `[host.<name>.params]`, checked before the launch.
-
-    None if the keys are not checked and the program reads them itself.
-    """
-    program: ClassVar[type[Program] | None] = None
-    """Keys of `[task]`, checked before the launch. None if it reads no task program."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
             if not isinstance(port, ProgramInput | ProgramOutput):
                 raise LevelError(

@@ -92,9 +92,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType, ModuleType
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self
 
-from pydantic import ValidationError, model_validator
+from pydantic import model_validator
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.queue import UNLIMITED
@@ -102,7 +102,7 @@ from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.compiled import preload
-from rack.levels.errors import LevelError, ProgramError
+from rack.levels.errors import LevelError
 from rack.levels.fault_steps import Fault
 from rack.levels.messages import ArmState
 from rack.levels.operator import (
@@ -133,6 +133,7 @@ from rack.levels.tables import (
     freeze_lists,
     list_live_keys,
     read_params,
+    read_program,
     set_live,
 )
 
@@ -160,40 +161,6 @@ __all__ = [
 
 Mismatches = Iterable[tuple[str, Any, str]]
 """Key, value and reason of each table entry that is inconsistent with something else."""
-
-
-P = TypeVar("P")
-
-
-def read_program(
-    validate: Callable[[Mapping[str, Any]], P],
-    table: Mapping[str, Any],
-    find_mismatches: Callable[[P], Mismatches],
-    place: str = "",
-) -> P:
-    """Return a valid program, or a part of one.
-
-    Args:
-        validate: Converts the table with pydantic.
-        table: The program as a table.
-        find_mismatches: Returns the inconsistencies of the program with arm or scene.
-        place: Prefix of the keys in the error text.
-
-    Raises:
-        ProgramError: The program is invalid. The text has one line per mistake.
-    """
-    try:
-        program = validate(table)
-    except ValidationError as error:
-        mistakes = [
-            f"{place}{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()
-        ]
-        raise ProgramError("\n".join(mistakes)) from error
-    if mistakes := [
-        f"{place}{key} = {value!r}: {why}" for key, value, why in find_mismatches(program)
-    ]:
-        raise ProgramError("\n".join(mistakes))
-    return program
 
 
 class Program(Table):
@@ -288,8 +255,8 @@ class LevelContext:
         return self.clock_ns * 1e-9
 
 
-class LevelSection:
-    """Common base class of executors and planners."""
+class PortOwner:
+    """Common base class of levels and host programs."""
 
     inputs: ClassVar[Mapping[str, InputPort[Any, Any]]] = {}
     """The ports that it reads, by name, collected from the class and its bases."""
@@ -299,16 +266,26 @@ class LevelSection:
     A planner has the single port "plan".
     """
     params: ClassVar[type[Table] | None] = None
-    """Keys of `[board.<name>.params]`, checked before the launch.
+    """Keys of `[board.<name>.params]`, or of `[host.<name>.params]`, checked before the launch.
 
-    Executor and planner share one table. None if the keys are not checked and the level reads them
+    Executor and planner share one table. None if the keys are not checked and the class reads them
     itself.
     """
     program: ClassVar[type[Program] | None] = None
     """Keys of `[task]`, checked before the launch.
 
-    None if the level reads no program, or checks it itself.
+    None if the class reads no program, or checks it itself.
     """
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
+
+
+class LevelSection(PortOwner):
+    """Common base class of executors and planners."""
+
     preloads: ClassVar[tuple[ModuleType, ...]] = ()
     """Modules whose functions marked `compiled_for` every process of the level needs.
 
@@ -320,11 +297,6 @@ class LevelSection:
 
     A subclass may annotate it: `settings: MyParams`. It is replaced when a live parameter is set.
     """
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections import ChainMap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import pairwise
@@ -31,7 +31,7 @@ from pydantic.fields import FieldInfo
 
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.rack_name import RACK_NAME
-from rack.levels.errors import LevelError
+from rack.levels.errors import LevelError, ProgramError
 from rack.levels.references import find_class
 
 T = TypeVar("T")
@@ -143,6 +143,37 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
     except ValidationError as error:
         valid = ", ".join(kind.model_fields)
         raise LevelError(f"params.{describe_first_error(error)}; keys: {valid}") from error
+
+
+def read_program(
+    validate: Callable[[Mapping[str, Any]], T],
+    table: Mapping[str, Any],
+    find_mismatches: Callable[[T], Iterable[tuple[str, Any, str]]],
+    place: str = "",
+) -> T:
+    """Return a valid program, or a part of one.
+
+    Args:
+        validate: Converts the table with pydantic.
+        table: The program as a table.
+        find_mismatches: Returns the inconsistencies of the program with arm or scene.
+        place: Prefix of the keys in the error text.
+
+    Raises:
+        ProgramError: The program is invalid. The text has one line per mistake.
+    """
+    try:
+        program = validate(table)
+    except ValidationError as error:
+        mistakes = [
+            f"{place}{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()
+        ]
+        raise ProgramError("\n".join(mistakes)) from error
+    if mistakes := [
+        f"{place}{key} = {value!r}: {why}" for key, value, why in find_mismatches(program)
+    ]:
+        raise ProgramError("\n".join(mistakes))
+    return program
 
 
 def describe_first_error(error: ValidationError) -> str:

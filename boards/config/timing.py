@@ -207,7 +207,6 @@ def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackC
             times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(measured[name]).items()}
             if board.planner is None:
                 times = {key: ms for key, ms in times.items() if key not in PLANNER_BUDGET}
-            limits = board.budget or BudgetConfig()
-            budget = limits.model_copy(update=times)
+            budget = (board.budget or BudgetConfig()).model_copy(update=times)
         boards[name] = board.model_copy(update={"budget": budget})
     return config.model_copy(update={"board": boards})

@@ -23,7 +23,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, compute_kind
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.keys import ping_key, pong_key
+from rack.boards.lan.keys import parse_sender, ping_key, pong_key
 from rack.boards.lan.link import LanLink, ReceivedMessage
 from rack.boards.lan.peers import NO_LAUNCH, PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
@@ -211,7 +211,7 @@ class Clocks:
         Called in a thread of zenoh.
         """
         received = monotonic_ns()
-        asker = ping.key.split("/")[1]
+        asker = parse_sender(ping.key)
         with self._lock:
             next_ns = self._again.get(asker)
             if received < (next_ns or 0) or (next_ns is None and len(self._again) == MAX_ASKERS):
@@ -273,7 +273,7 @@ class Clocks:
         head = self._sealer.open_message(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
-        clock = self._clocks.get(pong.key.split("/")[1])
+        clock = self._clocks.get(parse_sender(pong.key))
         launch, received_ns, epoch_ns, period_ns, clock_ns = _PONG.unpack(pong.payload)
         if (
             clock is None

@@ -280,8 +280,7 @@ def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | 
         return None
     if not trusted or not _is_p256(key):
         return None
-    expires = min(certificate.not_valid_after_utc for certificate in trusted)
-    return Identity(name, key, expires)
+    return Identity(name, key, min(certificate.not_valid_after_utc for certificate in trusted))
 
 
 def _read_common_name(certificate: Certificate) -> str:

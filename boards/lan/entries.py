@@ -8,7 +8,7 @@ from typing import Any
 from rack.backplane.mailbox.host_ring import has_permitted_values
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import build_message_dtype
-from rack.backplane.message import AnyMessage, fill_counts
+from rack.backplane.message import AnyMessage, Message, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, encode_switch
 from rack.boards.host.entries import NEVER, zero_counts
@@ -88,7 +88,21 @@ class SequenceTracker:
         return True
 
 
-class Export:
+class Counted:
+    """Part of the network adapter whose counters are a group of the adapter's status."""
+
+    count: Message
+
+    def restore_counts(self, record: Any) -> None:
+        """Restore the counters from the last status of the previous adapter."""
+        self.count.record[...] = record
+
+    def write_counts(self, record: Any) -> None:
+        """Write the counters into their group of the adapter's status."""
+        fill_counts(record, self.count.record.item())
+
+
+class Export(Counted):
     """Sends the messages of one mailbox of this rack.
 
     Attributes:
@@ -109,12 +123,8 @@ class Export:
         self._grid = grid
         self.every = grid.compute_period_cycles(table.rate_hz)
         self.must_resend = False
-        self.count = zero_counts(LanExport)
+        self.count: LanExport = zero_counts(LanExport)
         self._put: Callable[[bytes, bytes], None]
-
-    def restore_counts(self, record: Any) -> None:
-        """Restore the counters from the status of the previous adapter."""
-        self.count.record[...] = record
 
     def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Start publishing through a network link or, in lockstep, through a barrier."""
@@ -170,10 +180,6 @@ class Export:
             age_ns=stamp_ns - grid.stamp_ns(min(source.basis, written_tick)),
         )
         self._put(payload, self._sealer.seal(self._key, head, payload))
-
-    def write_counts(self, record: Any) -> None:
-        """Write the counters into their group of the adapter's status."""
-        fill_counts(record, self.count.record.item())
 
 
 class Import:
@@ -272,8 +278,7 @@ class Import:
             return
         self.count.taken += 1
         self._basis = basis
-        origin_ns = self._grid.to_local_ns(newest, self._peer, newest.age_ns)
-        self.count.origin_s = origin_ns * 1e-9
+        self.count.origin_s = self._grid.to_local_ns(newest, self._peer, newest.age_ns) * 1e-9
         out.message.raw[:] = self._buffer.raw
         # Ticks of mailboxes cannot be negative, but the message may predate this rack's tick 0.
         out.send(max(0, basis))

@@ -8,18 +8,17 @@ arrive, the oldest are overwritten, and a sender that gets no answer asks again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.lines import UtilityLines
-from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.host.entries import zero_counts
+from rack.boards.lan.entries import Counted
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.keys import estop_answer_key, estop_key
+from rack.boards.lan.keys import estop_answer_key, estop_key, parse_sender
 from rack.boards.lan.link import LanLink, Question
 from rack.boards.lan.status import LanDesk
 from rack.levels.level import Finding
@@ -31,7 +30,7 @@ REQUESTS_A_CYCLE = 16
 """Maximum number of requests that are buffered for a cycle and processed in it."""
 
 
-class EstopResponder:
+class EstopResponder(Counted):
     """Sets the emergency stop of this rack on request and adds a finding for each stop.
 
     Attributes:
@@ -55,7 +54,7 @@ class EstopResponder:
         self._findings = findings
         self._lines = UtilityLines(segment)
         self._requests: Callable[[], Iterator[Question]] = lambda: iter(())
-        self.count = zero_counts(LanDesk)
+        self.count: LanDesk = zero_counts(LanDesk)
 
     def open(self, link: LanLink, launch: int) -> None:
         """Start to accept requests, if any sender is permitted."""
@@ -68,7 +67,7 @@ class EstopResponder:
         """Answer each request of a permitted sender, and latch the stop unless it is a check."""
         for request, reply in self._requests():
             head = self._sealer.open_message(*request)
-            asker = request.key.split("/")[1]
+            asker = parse_sender(request.key)
             if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
                 self.count.dropped += 1
                 continue
@@ -85,14 +84,7 @@ class EstopResponder:
             seal = self._sealer.seal(estop_answer_key(self._rack, asker), answer, b"")
             reply(b"", attachment=seal)
 
-    def restore_counts(self, record: Any) -> None:
-        """Restore the counters from the last status of the previous adapter."""
-        self.count.record[...] = record
-
     def write_counts(self, record: object) -> None:
-        """Write the counters into their group of the adapter's status.
-
-        Nothing is written in lockstep, because the counters would differ from run to run.
-        """
+        """Write the counters, except in lockstep, where they would differ from run to run."""
         if not self._grid.is_lockstep:
-            fill_counts(record, self.count.record.item())
+            super().write_counts(record)

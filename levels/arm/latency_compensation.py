@@ -129,7 +129,6 @@ class PresentLink:
             change = -np.copysign(np.minimum(np.abs(velocity), time_s * self._braking), velocity)
         else:
             inertia, bias = self._dynamics.terms(position, velocity)
-            friction = self._dynamics.friction(velocity)
-            change = time_s * solve(inertia, torque - bias - friction)
+            change = time_s * solve(inertia, torque - bias - self._dynamics.friction(velocity))
         position += time_s * (velocity + 0.5 * change)
         velocity += change

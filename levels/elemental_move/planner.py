@@ -92,8 +92,7 @@ class ElementalMovePlanner(Planner):
         # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        cell = build_level_cell(context)
-        self._motion = MotionPlanner(cell, context.scene, context.seed)
+        self._motion = MotionPlanner(build_level_cell(context), context.scene, context.seed)
         self._published: list[PublishedPath] = []
         self._job: PlanningJob | None = None
         self._window: list[Move] = []

@@ -107,8 +107,7 @@ class MotionPlanner:
 
     def set_situation(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation`, and permit the contacts that `move` intends."""
-        touched = move.object if move.can_touch else None
-        situation.apply_to(self.checker, touched)
+        situation.apply_to(self.checker, move.object if move.can_touch else None)
 
     def find_goal(self, move: Move, start: Array) -> Array:
         """Return the configuration at the end of a free motion, in the situation set last.

@@ -277,8 +277,7 @@ class FixedJaw:
         Returns:
             The shifted pose, or `tool` if the jaw would not meet the object.
         """
-        present_tool = read_site_pose(self._data, self._cell.tool)
-        relative = present_tool @ tool.inverse() @ object_pose
+        relative = read_site_pose(self._data, self._cell.tool) @ tool.inverse() @ object_pose
         along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]
         travel = -SEARCH_RANGE_M
         for _ in range(MAX_SEARCH_STEPS):

@@ -203,8 +203,7 @@ class _Solver:
         Return 0 and -1 if no equality couples the joints.
         """
         data = self._data
-        jacobian = self._compute_jacobian()
-        rows = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
+        rows = np.any(self._compute_jacobian()[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
         rows &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         if not rows.any():
             return 0.0, -1

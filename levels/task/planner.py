@@ -52,8 +52,7 @@ class TaskPlanner(Planner):
         self._program = self._read_first_program()
         self._id = FIRST_PLAN_ID
         self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
-        cell = build_level_cell(context)
-        self._motion = MotionPlanner(cell, context.scene, context.seed)
+        self._motion = MotionPlanner(build_level_cell(context), context.scene, context.seed)
         self._plan: TaskPlan | None = None  # plan made by this process
         self._visible_at = 0  # tick from which that plan is visible
         self._since: int | None = None  # tick of the first cycle

@@ -8,9 +8,10 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rack.levels.errors import ProgramError
-from rack.levels.level import LevelContext, read_program
+from rack.levels.level import LevelContext
 from rack.levels.operator import Goal
 from rack.levels.systems.coordination.messages import CellAction, OrderAction
+from rack.levels.tables import read_program
 from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, find_mismatches
 
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)

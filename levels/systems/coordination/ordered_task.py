@@ -152,8 +152,7 @@ class OrderedTaskExecutor(TaskExecutor):
             report.earliest = plan.earliest
         if response is Response.POSSIBLE and request.by:
             report.until = request.begin + request.ahead + request.by - plan.earliest
-        below = self.below.message
-        self.report.operated = below.operated or self._orders.is_in_force
+        self.report.operated = self.below.message.operated or self._orders.is_in_force
         return plan if self._begun and self._begun == plan.id else self._nothing
 
     def _read_order(self, reading: Reading[CellOrder]) -> None:

@@ -277,8 +277,7 @@ class Workstation(HostProgram):
             known = ", ".join(context.scene.objects) or "none"
             raise LevelError(f"params.object = {p.object}: not in the scene; objects: {known}")
         self._row = context.scene.objects.index(p.object)
-        cell = build_level_cell(context)
-        self._planner = GraspPlanner(cell, p.opposing, p.rules)
+        self._planner = GraspPlanner(build_level_cell(context), p.opposing, p.rules)
         self._planned: PlannedGrasp | None = None
         self._at = np.full(3, np.inf)  # (3,), m: position of the object in the newest plan
 
