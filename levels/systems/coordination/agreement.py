@@ -38,8 +38,8 @@ ATTEMPTS = 1000
 MAX_ATTEMPTS = 10
 """Number of attempts after which the program ends."""
 NEGATIVE = (Response.REFUSED, Response.FAILED)
-INTERRUPTED = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
-BEGUN = (Response.DOING, Response.DONE)
+INTERRUPTED = {Response.CANCELLED, Response.STOPPED, Response.ENDED}
+BEGUN = {Response.DOING, Response.DONE}
 VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
 """Verb of the orders to the arms of the step, by phase."""
 SAVED_ATTRIBUTES = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
@@ -191,14 +191,13 @@ class Agreement:
         responses = self._read_responses(self.partners)
         if self._end_if_any(responses, NEGATIVE):
             return
-        if any(response in INTERRUPTED for response in responses.values()):
+        given = set(responses.values())
+        if given & INTERRUPTED:
             self.phase = Phase.CANCELLING
-        elif any(response in BEGUN for response in responses.values()):
+        elif given & BEGUN:
             # An earlier launch of this rack has already told the arms to begin.
             self.phase = Phase.DOING
-        elif all(
-            response is Response.POSSIBLE for response in responses.values()
-        ) and self._are_present(responses):
+        elif given == {Response.POSSIBLE} and self._are_present(responses):
             arrives_s = self._now_s + self._margin_s
             times = [self._answers[arm].message.until for arm in responses]
             in_time = all(arrives_s <= until_s for until_s in times if until_s)
