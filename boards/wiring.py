@@ -53,13 +53,14 @@ class SnapshotPolicy:
     """Policy for the snapshots of a rack in lockstep.
 
     Attributes:
-        part: Snapshots are taken as often as possible, but take at most 1 / `part` of the run's
-            time. 0 for no such snapshots.
+        part: Snapshots are taken as often as possible, but stop the rack for at most 1 / `part` of
+            the run's time. 0 for no such snapshots. The default keeps their cost below 3 %, as it
+            is about twice the standstill: the processes then copy each page that they write.
         every: Number of ticks between additional periodic snapshots, 0 for none.
         at: Tick before which one additional snapshot is taken, None for none.
     """
 
-    part: int = 40
+    part: int = 80
     every: int = 0
     at: int | None = None
 

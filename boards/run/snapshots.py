@@ -78,8 +78,9 @@ class ClockCopies:
     """Takes the snapshots of a rack.
 
     Snapshots are taken as often as possible without stopping the rack for more than 1 /
-    `System.SNAPSHOT_PART` of the time. Additional snapshots are taken every `System.SNAPSHOT_EVERY`
-    ticks, and before the tick in `System.SNAPSHOT_AT`.
+    `System.SNAPSHOT_PART` of the time. The first one is taken at once, so that every tick can be
+    reached. Additional snapshots are taken every `System.SNAPSHOT_EVERY` ticks, and before the tick
+    in `System.SNAPSHOT_AT`.
 
     Attributes:
         cost_s: Time for which the last snapshot stopped the rack.

@@ -31,8 +31,7 @@ from tests.processes import BOUND_S, FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
 SECONDS = 1.0
-OFTEN = SnapshotPolicy(part=1)
-"""About half of the time goes into snapshots."""
+OFTEN = SnapshotPolicy(every=100)
 
 
 @pytest.fixture

@@ -4,36 +4,43 @@ from __future__ import annotations
 
 import errno
 import os
-import time
+from itertools import pairwise
 from pathlib import Path
 from socket import socketpair
-from time import process_time_ns
 from types import SimpleNamespace
 
 import pytest
 
-from rack.backplane.process import busy_wait_until, name_process
+from rack.backplane.process import name_process
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.errors import SnapshotError
+from rack.boards.run import snapshots
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
+from rack.boards.wiring import SnapshotPolicy
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 
 PART = 20
-COST_NS = 2_000_000
+MOST_COST = 0.03
+"""Largest share of lockstep's time that snapshots may cost."""
+COST_PER_STANDSTILL = 2.0
+"""Measured with nasrem: with the memory pages that are copied afterwards, a snapshot costs twice
+the time for which it stops the rack."""
 
 
 class StubCopier:
-    """Stands for a fork: takes some time, and notes the tick."""
+    """Stands for a fork: takes `cost_s` of a simulated time, and notes the tick."""
 
     def __init__(self) -> None:
         self.ticks: list[int] = []
+        self.now_s = 5.0
+        self.cost_s = 0.0
 
     def fork_copy(self, tick: int, memory: int) -> None:
         """Take time."""
-        busy_wait_until(process_time_ns() + COST_NS)
+        self.now_s += self.cost_s
         self.ticks.append(tick)
 
 
@@ -42,29 +49,44 @@ def segment(make_bus: MakeBus) -> Segment:  # noqa: F811
     return make_bus(task("level"))
 
 
-def copies_of(segment: Segment) -> tuple[ClockCopies, StubCopier]:
-    copier = StubCopier()
+def copies_of(segment: Segment, copier: StubCopier) -> ClockCopies:
     # No task is there to fork.
     driver = SimpleNamespace(tasks=(), wait_until_settled=lambda: None)
-    return ClockCopies(segment, driver, copier), copier  # type: ignore[arg-type]
+    return ClockCopies(segment, driver, copier)  # type: ignore[arg-type]
 
 
-def test_snapshots_take_a_limited_share_of_the_time(segment: Segment) -> None:
+@pytest.mark.parametrize("cost_s", [0.004, 0.02, 0.15])
+def test_snapshots_take_a_limited_share_of_the_time(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch, cost_s: float
+) -> None:
+    copier = StubCopier()
+    monkeypatch.setattr(snapshots, "time", SimpleNamespace(monotonic=lambda: copier.now_s))
     segment.words[System.SNAPSHOT_PART] = PART
-    copies, copier = copies_of(segment)
-    started_s = time.monotonic()
-    costs_s: list[float] = []
-    tick = 0
-    while len(copier.ticks) < 4:
+    copies = copies_of(segment, copier)
+    started_s = copier.now_s
+    stopped_s, taken_at_s = 0.0, [started_s]
+    # From the third snapshot on, they cost twice as much.
+    for tick in range(1_000_000):
+        copier.cost_s = cost_s * (2.0 if len(copier.ticks) > 2 else 1.0)
         taken = len(copier.ticks)
         copies(tick)
         if len(copier.ticks) > taken:
-            elapsed_s = time.monotonic() - started_s - copies.cost_s
-            assert sum(costs_s) * PART <= elapsed_s
-            costs_s.append(copies.cost_s)
-        tick += 1
-    assert min(costs_s) >= COST_NS * 1e-9
-    assert copier.ticks[0] == 0
+            # The first one is taken at once.
+            assert stopped_s * PART <= copier.now_s - copier.cost_s - started_s
+            taken_at_s.append(copier.now_s)
+            stopped_s += copier.cost_s
+        if len(copier.ticks) == 6:
+            break
+        copier.now_s += 0.001
+    spacings_s = [later - earlier for earlier, later in pairwise(taken_at_s)]
+    expected_s = [cost_s, *[cost_s * (PART + 1)] * 2]
+    expected_s += [cost_s * (PART + 2), *[2.0 * cost_s * (PART + 1)] * 2]
+    # A snapshot comes as soon as its cost permits.
+    assert spacings_s == pytest.approx(expected_s, abs=0.0021)
+
+
+def test_the_default_spacing_keeps_the_cost_of_snapshots_below_its_limit() -> None:
+    assert COST_PER_STANDSTILL / SnapshotPolicy().part <= MOST_COST
 
 
 def test_snapshots_are_taken_periodically_and_before_the_requested_tick(
@@ -72,7 +94,8 @@ def test_snapshots_are_taken_periodically_and_before_the_requested_tick(
 ) -> None:
     segment.words[System.SNAPSHOT_EVERY] = 30
     segment.words[System.SNAPSHOT_AT] = 50 + 1
-    copies, copier = copies_of(segment)
+    copier = StubCopier()
+    copies = copies_of(segment, copier)
     tick = 0
     while tick <= 100:
         # No batch goes beyond what it returns.
@@ -81,7 +104,8 @@ def test_snapshots_are_taken_periodically_and_before_the_requested_tick(
 
 
 def test_no_snapshot_is_taken_without_a_request(segment: Segment) -> None:
-    copies, copier = copies_of(segment)
+    copier = StubCopier()
+    copies = copies_of(segment, copier)
     assert min(copies(tick) for tick in range(50)) > 1 << 60
     assert copier.ticks == []
 
