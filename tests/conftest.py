@@ -17,6 +17,7 @@ import pytest
 
 from rack.tools.commands.new import TEMPLATES
 from tests import warm
+from tests.link import MakeLink, links
 from tests.machine import stolen, turn
 
 SMALL = f"""
@@ -134,6 +135,13 @@ def _in_stock() -> Iterator[None]:
 def rack_name() -> str:
     """A name for a rack that no other test, of this run or another, uses at the same time."""
     return f"test-{os.getpid()}-{next(_NUMBERS)}"
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    """Make links of a writer and a reader over one mailbox."""
+    with links(rack_name) as make:
+        yield make
 
 
 @pytest.fixture
