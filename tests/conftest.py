@@ -14,6 +14,7 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from rack.tools.commands.new import TEMPLATES
 from tests import warm
@@ -57,6 +58,9 @@ by hand, takes hours."""
 _NUMBERS = count()
 
 
+# A busy machine may hold up any example.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 _NO_TURN = pytest.StashKey[str]()
 _STOLEN = pytest.StashKey[int]()
 RERUNS = 2

@@ -40,6 +40,7 @@ from rack.backplane.process import list_children
 from rack.boards.crate import line
 from rack.boards.crate.line import build_environment
 from rack.tools.console.interrupt import SIGNALS
+from rack.tools.launch import other_racks
 from rack.tools.recording.recorder import process as recorder_process
 
 CRATE = "rack.boards.crate"
@@ -48,7 +49,6 @@ COMMAND = "rack.tools.cli"
 LAUNCHERS = ("tests.boards.launcher", "tests.boards.lan.racks")
 """Programs of tests that launch racks, as a user's program does."""
 STARTERS = (line, recorder_process)
-OTHERS = "rack.tools.launch.other_racks"
 """Modules that start a rack's programs by `subprocess`."""
 LIBRARIES = {
     CRATE: ("rack.boards.crate.crate",),
@@ -301,7 +301,7 @@ def _take_over(order: Order, fds: Sequence[int]) -> None:
     sys.path[:] = path if order.is_safe else [order.folder, *path]
     if order.module in (COMMAND, *LAUNCHERS):
         _open_streams(bool(order.environment.get("PYTHONUNBUFFERED")))
-        for starter in (*STARTERS, importlib.import_module(OTHERS)):
+        for starter in (*STARTERS, other_racks):
             starter.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": Fork})
 
 
