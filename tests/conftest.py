@@ -14,9 +14,11 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from rack.tools.commands.new import TEMPLATES
 from tests import warm
+from tests.link import MakeLink, links
 from tests.machine import stolen, turn
 
 SMALL = f"""
@@ -56,6 +58,9 @@ by hand, takes hours."""
 _NUMBERS = count()
 
 
+# A busy machine may hold up any example.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 _NO_TURN = pytest.StashKey[str]()
 _STOLEN = pytest.StashKey[int]()
 RERUNS = 2
@@ -134,6 +139,13 @@ def _in_stock() -> Iterator[None]:
 def rack_name() -> str:
     """A name for a rack that no other test, of this run or another, uses at the same time."""
     return f"test-{os.getpid()}-{next(_NUMBERS)}"
+
+
+@pytest.fixture
+def link(rack_name: str) -> Iterator[MakeLink]:
+    """Make links of a writer and a reader over one mailbox."""
+    with links(rack_name) as make:
+        yield make
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What the product derives from the shipped configs, as digests by case and part.
+"""What the product derives from the shipped configs, as a digest of each case.
 
 A snapshot says that something changed, not what is right: other tests say that. It stands in a TOML
 file beside its test. `make golden` writes all anew, and git shows which cases changed.
@@ -48,12 +48,13 @@ each_shipped_rack = pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SHIPPED],
 )
+HEAD = "# Made by `make golden`, see tests/snapshots.py."
 WRITES = "WRITE_SNAPSHOTS"
 """Set in the environment, it makes `Snapshots.check` write."""
 
 
 class Snapshots:
-    """The snapshots of a test's file."""
+    """The snapshots of a test's file: one digest for each case."""
 
     def __init__(self, test: str) -> None:
         self._path = Path(test).with_suffix(".toml")
@@ -63,23 +64,31 @@ class Snapshots:
         found = {part: digest(value) for part, value in parts.items()}
         known = self.known
         if WRITES in os.environ:
-            known[case] = found
+            known[case] = digest(found)
             self._write()
-        changed = [part for part in found if known.get(case, {}).get(part) != found[part]]
-        assert not changed, f"{case}: other {', '.join(changed)} than before; meant? make golden"
-        assert found.keys() == known[case].keys()
+        is_same = known.get(case) == digest(found)
+        assert is_same, f"{case}: other than before; meant? make golden; its parts: {found}"
+
+    def check_all(self, group: str, cases: Mapping[str, Mapping[str, object]]) -> None:
+        """Check all cases that begin with `group`: those of the file are these and no others."""
+        known = {case for case in self.known if case.startswith(group)}
+        if WRITES in os.environ:
+            for case in known - cases.keys():
+                del self.known[case]
+        else:
+            assert known == cases.keys()
+        for case, parts in cases.items():
+            self.check(case, parts)
 
     @cached_property
-    def known(self) -> dict[str, dict[str, str]]:
-        """What the file says: digests by case and part."""
+    def known(self) -> dict[str, str]:
+        """What the file says: digests by case."""
         return tomllib.loads(self._path.read_text()) if self._path.exists() else {}
 
     def _write(self) -> None:
-        lines = ["# Made by `make golden`, see tests/snapshots.py."]
-        for case, parts in sorted(self.known.items()):
-            lines += ["", f"[{json.dumps(case)}]"]
-            lines += [f"{json.dumps(part)} = {json.dumps(parts[part])}" for part in parts]
-        self._path.write_text("\n".join(lines) + "\n")
+        known = sorted(self.known.items())
+        cases = (f"{json.dumps(case)} = {json.dumps(found)}" for case, found in known)
+        self._path.write_text("\n".join((HEAD, "", *cases, "")))
 
 
 def digest(value: object) -> str:

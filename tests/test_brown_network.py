@@ -28,6 +28,7 @@ from tests.processes import RACK, wait_until
 from tests.snapshots import Snapshots
 from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY
 from tests.tools.command_line import ROOT, rack
+from tests.warm import Popen, run_command
 
 SNAPSHOTS = Snapshots(__file__)
 LINK_OUT = """
@@ -180,7 +181,7 @@ class Launched:
         _, general = configs(name, folder)
         command = [*RACK, "run", str(general), "--lockstep", "--no-record", *words]
         self.name = name
-        self.process = subprocess.Popen(
+        self.process = Popen(
             command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
@@ -240,7 +241,7 @@ def repeated(run: Path, out: Path) -> tuple[str, str]:
     """Continue a run from 1.3 s, in the middle of a modification, to 3 s; return digest and
     stderr."""
     command = [*RACK, "run", "--from", f"{run}@1.3", "--seconds", "3", "--json", "--out", out]
-    done = subprocess.run(command, timeout=MOST_S, capture_output=True, text=True, check=False)
+    done = run_command(command, MOST_S, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)["digest"], done.stderr
 
@@ -259,9 +260,7 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
 ) -> None:
     general = configs(rack_name, tmp_path, LINK_OUT)[1]
     command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json"]
-    done = subprocess.run(
-        command, cwd=tmp_path, timeout=MOST_S, capture_output=True, text=True, check=False
-    )
+    done = run_command(command, MOST_S, cwd=tmp_path, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     for own, other in ((report, f"{rack_name}-servo"), (report["others"][0], rack_name)):
@@ -276,12 +275,12 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
 def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> None:
     servo, general = configs(rack_name, tmp_path)
     alone = [*RACK, "run", general, "--lockstep", "--share", "--no-record", "--seconds", "1.6"]
-    other = subprocess.Popen([*alone, "--set", "adapter.lan.launch=[]"], stdout=subprocess.DEVNULL)
+    other = Popen([*alone, "--set", "adapter.lan.launch=[]"], stdout=subprocess.DEVNULL)
     try:
         run = tmp_path / "run"
         words = ["--lockstep", "--share", "--seconds", "3", "--json", "--out", run]
         command = [*RACK, "run", servo, *words, "--set", 'adapter.lan.on_peer_loss="stop"']
-        done = subprocess.run(command, timeout=MOST_S, capture_output=True, text=True, check=False)
+        done = run_command(command, MOST_S, text=True)
     finally:
         other.kill()
         other.wait()
@@ -307,9 +306,7 @@ def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
 ) -> None:
     general = configs(rack_name, tmp_path)[1]
     command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json", "--share"]
-    done = subprocess.run(
-        command, cwd=tmp_path, timeout=MOST_S, capture_output=True, text=True, check=False
-    )
+    done = run_command(command, MOST_S, cwd=tmp_path, text=True)
     assert done.returncode == 0, done.stderr
     upper = json.loads(done.stdout)
     lower = json.loads((tmp_path / upper["others"][0]["folder"] / "report.json").read_text())

@@ -53,17 +53,19 @@ def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts() -> Non
         assert np.unique((rows["tick"] - sampled)[sampled > 20]).tolist() == [1]
 
 
+SECONDS = 2.75
+"""The grasp has then squeezed for a third of a second."""
 WRITES = "host.workstation.params.writes=[{ at = 1.5, word = 0, value = 2500 }]"
 
 
 def test_a_word_of_the_workstation_acts_at_a_tick_and_is_entered_again(
     rack_name: str, tmp_path: Path
 ) -> None:
-    settings = ("--set", f"name={rack_name}", "--lockstep", "--seconds", 4)
+    settings = ("--set", f"name={rack_name}", "--lockstep", "--seconds", SECONDS)
     one, two, three = (tmp_path / name for name in ("one", "two", "three"))
     rack("run", "condor", *settings, "--set", WRITES, "--out", one)
     rack("run", "condor", *settings, "--entries", one, "--out", two)
-    rack("run", "--from", f"{one}@1.0", "--seconds", 4, "--out", three)
+    rack("run", "--from", f"{one}@1.0", "--seconds", SECONDS, "--out", three)
     reports = [json.loads((run / "report.json").read_text()) for run in (one, two, three)]
     assert len({report["digest"] for report in reports}) == 1
     runs = [Recording(run) for run in (one, two)]
@@ -98,7 +100,7 @@ def test_handlers_that_preempt_the_fingers_are_predicted_and_make_them_late(
         # Runs with late fingers repeat as well.
         for _ in range(1 + is_late):
             with Rack(config) as crate:
-                outcome = crate.run(0.5)
+                outcome = crate.run(0.3)
                 blocks = {name: crate.segment.get_block(name) for name in FINGERS}
                 counts = [(b[Block.CYCLES], b[Block.MISSED]) for b in blocks.values()]
             found.append((outcome.digest, counts))

@@ -49,8 +49,8 @@ def test_no_number_changes_unseen(room: str) -> None:
         if not info.ispkg and not info.name.endswith("__main__"):
             numbers = dict(_numbers(importlib.import_module(info.name)))
             if numbers:
-                found[info.name] = numbers
-    SNAPSHOTS.check(room, found)
+                found[f"{room}: {info.name.rsplit('.', 1)[1]}"] = {"numbers": numbers}
+    SNAPSHOTS.check_all(f"{room}: ", found)
 
 
 def _numbers(module: ModuleType) -> Iterator[tuple[str, Any]]:

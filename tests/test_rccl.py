@@ -4,7 +4,6 @@ queue and holds; two arms begin their motions together."""
 from __future__ import annotations
 
 import os
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from tests.processes import RACK
+from tests.warm import run_command
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(240)]
 
@@ -86,9 +86,7 @@ def run_two_arms(folder: Path, faults: Mapping[str, str]) -> dict[str, Recording
         text = text.replace('"two-arms.toml"', f'"{CONFIGS / "rccl" / "two-arms.toml"}"')
         (folder / f"{arm}.toml").write_text(text + faults.get(arm, ""))
     command = [*RACK, "run", "left.toml", "--out", "left", "--share"]
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=MOST_S, check=False
-    )
+    done = run_command(command, MOST_S, cwd=folder, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     (right,) = (folder / "runs").iterdir()
     return {"left": Recording(folder / "left"), "right": Recording(right)}

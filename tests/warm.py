@@ -40,11 +40,14 @@ from rack.backplane.process import list_children
 from rack.boards.crate import line
 from rack.boards.crate.line import build_environment
 from rack.tools.console.interrupt import SIGNALS
+from rack.tools.launch import other_racks
 from rack.tools.recording.recorder import process as recorder_process
 
 CRATE = "rack.boards.crate"
 RECORDER = "rack.tools.recording.recorder"
 COMMAND = "rack.tools.cli"
+LAUNCHERS = ("tests.boards.launcher", "tests.boards.lan.racks")
+"""Programs of tests that launch racks, as a user's program does."""
 STARTERS = (line, recorder_process)
 """Modules that start a rack's programs by `subprocess`."""
 LIBRARIES = {
@@ -66,6 +69,7 @@ LIBRARIES[COMMAND] = (
     "rack.tools.report.report_markdown",
     "typer",
 )
+LIBRARIES.update(dict.fromkeys(LAUNCHERS, (*LIBRARIES[CRATE], "tests.boards.lan.racks")))
 PR_SET_CHILD_SUBREAPER = 36
 FIRST_FREE = 1 << 10
 """Descriptors wait up here for their own numbers, so that none takes another's."""
@@ -189,8 +193,13 @@ class Fork(subprocess.Popen[Any]):
 
     def _execute_child(self, *given: Any) -> None:
         order, fds = read_order(given)
+        before_start, process_group = given[2], given[22]
         self.pid = os.fork()
         if self.pid == 0:
+            if process_group == 0:
+                os.setpgid(0, 0)
+            if before_start is not None:
+                before_start()
             for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
                 # As by `exec`: what is handled is no longer, what is ignored still is.
                 if signal.getsignal(number) not in (signal.SIG_IGN, signal.SIG_DFL, None):
@@ -290,9 +299,9 @@ def _take_over(order: Order, fds: Sequence[int]) -> None:
     given = order.environment.get("PYTHONPATH", "").split(os.pathsep)
     path = dict.fromkeys(filter(None, [*given, *sys.path]))
     sys.path[:] = path if order.is_safe else [order.folder, *path]
-    if order.module == COMMAND:
+    if order.module in (COMMAND, *LAUNCHERS):
         _open_streams(bool(order.environment.get("PYTHONUNBUFFERED")))
-        for starter in STARTERS:
+        for starter in (*STARTERS, other_racks):
             starter.subprocess = SimpleNamespace(**{**vars(subprocess), "Popen": Fork})
 
 
@@ -356,7 +365,7 @@ def main() -> None:
         sys.path.remove(str(ROOT))
     gc.freeze()
     if order := served(socket.socket(fileno=int(number))):
-        if order.module == COMMAND:
+        if order.module in (COMMAND, *LAUNCHERS):
             run_and_exit(order)
         runpy.run_module(order.module, run_name="__main__", alter_sys=True)
 

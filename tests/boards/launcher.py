@@ -1,5 +1,7 @@
-"""A user's program that runs a rack: `python launcher.py CONFIG [--fork] [KEY=VALUE]...`; prints
-once launched."""
+"""A user's program that runs a rack, and prints once it is launched.
+
+python -m tests.boards.launcher CONFIG [--fork] [KEY=VALUE]...
+"""
 
 from __future__ import annotations
 

@@ -11,17 +11,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tests.processes import BOUND_S, runs, wait_until
+from tests.warm import Popen
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 class Program:
     """A launcher in its own session."""
 
     def __init__(self, config: Path, *settings: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, str(HERE / "launcher.py"), str(config), *settings],
+        self._process = Popen(
+            [sys.executable, "-m", "tests.boards.launcher", str(config), *settings],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from rack.backplane.layout import PROTOCOLS, TICK_PROTOCOLS, Protocol
 from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME, message_address
-from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
+from tests.link import Link, MakeLink, ReadingTask, WritingTask
 
 
 def publish(rack: Link, tick: int, visible_at: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 
 import pytest
 
@@ -14,16 +13,10 @@ from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME
-from tests.link import MakeLink, WritingTask, links
+from tests.link import MakeLink, WritingTask
 from tests.processes import FORKS, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

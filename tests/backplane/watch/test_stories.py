@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from rack.backplane.layout import PROTOCOLS, Protocol
-from tests.link import MakeLink, links, story
+from tests.link import MakeLink, story
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
@@ -28,12 +26,6 @@ FAULTS: dict[str, tuple[float, ...]] = {
     "corrupt": (0.4,),
     "babble": (),
 }
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
 
 
 @pytest.mark.parametrize("fault", FAULTS)

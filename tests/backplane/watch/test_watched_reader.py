@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import pytest
-
 from rack.backplane.layout import TickGrid
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.watched_reader import (
@@ -15,13 +11,7 @@ from rack.backplane.watch.watched_reader import (
 )
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME
-from tests.link import Link, MakeLink, links
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
+from tests.link import Link, MakeLink
 
 
 class Grid:

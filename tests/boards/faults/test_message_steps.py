@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 
 import pytest
 
@@ -17,7 +16,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME
-from tests.link import Link, MakeLink, WritingTask, links, struck
+from tests.link import Link, MakeLink, WritingTask, struck
 from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -35,12 +34,6 @@ ALSO = {"delay": {Alarm.MUTE}, "reorder": {Alarm.HELD_BACK}}
 """Other permitted alarms: a delayed message is at first missing; the last swapped message is
 late."""
 BEGIN, END, LAST = 64, 160, 320
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
 
 
 def run_with_fault(rack: Link, kind: str) -> FaultEntry | None:

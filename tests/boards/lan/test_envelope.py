@@ -10,7 +10,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import rack.boards.lan
@@ -36,7 +36,6 @@ HEADS = st.builds(
     Envelope, WORDS, WORDS, WORDS, WORDS, SIGNED, SIGNED, SIGNED, st.integers(0, 2**32 - 1), SIGNED
 )
 PAYLOADS = st.binary(max_size=MOST)
-UNTIMED = settings(deadline=None)
 PLACES = st.integers(0, 1 << 20)
 """Of which those within an envelope count: the length of a signature varies."""
 
@@ -57,7 +56,6 @@ def sealer(folder: Path, request: pytest.FixtureRequest) -> Sealer:
 
 
 @pytest.mark.slow
-@UNTIMED
 @given(st.text(), HEADS, PAYLOADS)
 def test_a_sealed_message_is_opened_unchanged(
     sealer: Sealer, end: str, head: Envelope, payload: bytes
@@ -66,7 +64,6 @@ def test_a_sealed_message_is_opened_unchanged(
     assert sealer.open_message(key, sealer.seal(key, head, payload), payload) == head
 
 
-@UNTIMED
 @given(
     st.text(),
     st.none() | st.binary(max_size=2 * _HEAD.size),
@@ -80,7 +77,6 @@ def test_arbitrary_input_raises_nothing_and_never_passes(
     assert isinstance(sealer.open_message(key, given, payload), Flaw)
 
 
-@UNTIMED
 @given(PLACES, PAYLOADS)
 def test_no_bit_of_envelope_or_payload_can_change(
     sealer: Sealer, place: int, payload: bytes
@@ -93,7 +89,6 @@ def test_no_bit_of_envelope_or_payload_can_change(
     assert isinstance(sealer.open_message(KEY, bytes(whole[:at]), bytes(whole[at:])), Flaw)
 
 
-@UNTIMED
 @given(PLACES, st.binary(min_size=1, max_size=16))
 def test_a_message_with_another_end_is_no_message(sealer: Sealer, place: int, more: bytes) -> None:
     payload = b"content"
@@ -106,7 +101,6 @@ def test_a_message_with_another_end_is_no_message(sealer: Sealer, place: int, mo
     assert isinstance(sealer.open_message(KEY, envelope + more, payload), Flaw)
 
 
-@UNTIMED
 @given(st.text(min_size=1), st.text(), PAYLOADS)
 def test_a_message_replayed_under_another_key_is_unsigned(
     sealer: Sealer, end: str, other: str, payload: bytes

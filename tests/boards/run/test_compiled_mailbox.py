@@ -224,7 +224,7 @@ def drive(
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(PROTOCOLS, RATES, st.lists(OPERATIONS, min_size=20, max_size=60))
 def test_machine_code_leaves_every_byte_and_verdict_as_python_does(
     protocol: Protocol, rates: tuple[int, int], operations: list[Operation]
@@ -234,7 +234,7 @@ def test_machine_code_leaves_every_byte_and_verdict_as_python_does(
 
 @pytest.mark.thorough
 @pytest.mark.timeout(600)
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=1000)
 @given(PROTOCOLS, RATES, st.lists(OPERATIONS, min_size=40, max_size=120))
 def test_machine_code_leaves_every_byte_and_verdict_as_python_does_at_length(
     protocol: Protocol, rates: tuple[int, int], operations: list[Operation]

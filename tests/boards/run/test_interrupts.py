@@ -195,8 +195,7 @@ def cycle(config: MakeConfig, *settings: str) -> Cycles:
 def test_handlers_take_their_time_from_the_computation_as_predicted(
     config: MakeConfig, settings: tuple[str, ...], is_late: bool
 ) -> None:
-    first, second = cycle(config, *settings), cycle(config, *settings)
-    assert first == second
+    first = cycle(config, *settings)
     rack = config(*settings, text=RACK)
     found = evaluate_rack(build_rack_timing(rack, resolve_layout(rack)))
     preempted = [v for v in found if (v.equation, v.subject) == (RESPONSE_TIME, "hub")]
@@ -204,6 +203,7 @@ def test_handlers_take_their_time_from_the_computation_as_predicted(
     assert bool(first.missed) == is_late
     assert first.cycles + first.skipped in (TICKS, TICKS - is_late)
     if is_late:
+        assert cycle(config, *settings) == first
         interrupt = resolve_layout(rack).find_mailbox("figure0.status").interrupt
         assert interrupt is not None
         # The messages of the next tick come before the computation ends.

@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import pytest
-
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.boards.faults.message_steps import forge_message
 from rack.levels.level import Output
 from tests.backplane.bus import NAME, Point
-from tests.link import MakeLink, links
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
+from tests.link import MakeLink
 
 
 def test_a_message_at_its_own_rate_is_visible_at_multiples_of_its_period(link: MakeLink) -> None:

@@ -140,7 +140,7 @@ def link(rack_name: str) -> Iterator[MakeQueue]:
         one.close()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     capacity=st.integers(1, 6),
     rates=st.tuples(st.integers(1, 6), st.integers(1, 6)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, PLANNED, UNJUDGED, MakeConfig
 from tests.boards.runs import end_of, faulty, kill
 from tests.processes import BOUND_S, RACK, wait_until
+from tests.warm import run_command
 
 STANDBY = "board.wave.standby={slot=9,core=0}"
 TWO = "board.wave.standby=[{slot=9,core=0},{slot=10,core=1}]"
@@ -281,13 +281,8 @@ def test_a_level_that_is_not_deterministic_cannot_be_compared(
     text = PLAIN.replace("wave_levels:Wave", "wave_levels:Lottery")
     path = tmp_path / "lottery.toml"
     path.write_text(config(STANDBY, "board.wave.compare=true", text=text).to_toml_text())
-    done = subprocess.run(
-        [*RACK, "run", str(path), "--seconds", "0.5", "--no-record"],
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S * 5,
-        check=False,
-    )
+    command = [*RACK, "run", str(path), "--seconds", "0.5", "--no-record"]
+    done = run_command(command, BOUND_S * 5, text=True)
     line = (
         "board.wave.compare = true: the level is not deterministic: 'wave.status': a standby"
         " computes another value, at the start"

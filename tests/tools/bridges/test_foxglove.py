@@ -182,6 +182,6 @@ def test_a_missing_extra_is_named_and_the_rack_runs(rack_name: str, tmp_path: Pa
     words = ("fig2", "--ros2", "--foxglove", "--no-record")
     hidden = {"PYTHONPATH": str(tmp_path)}
     with held_rack(tmp_path, rack_name, words, hidden) as held:
-        held.step(100)
+        held.step(5)
         held.wait_for("ros2: zenoh is missing: pip install 'nasrem-rack[ros2]'")
         held.wait_for("foxglove: foxglove is missing: pip install 'nasrem-rack[foxglove]'")

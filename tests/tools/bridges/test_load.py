@@ -15,7 +15,7 @@ from tests.tools.command_line import rack
 def test_a_rack_with_bridges_has_the_same_digest(
     rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("nasrem", "--lockstep", "--seconds", "2", "--no-record", "--json")
+    words = ("nasrem", "--lockstep", "--seconds", "1", "--no-record", "--json")
 
     def run(*bridges: str, **settings: str) -> str:
         with monkeypatch.context() as patch:

@@ -10,16 +10,22 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rack.backplane.segment import list_racks
-from tests.processes import RACK
 from tests.tools.command_line import BOUND_S, ROOT
 from tests.tools.held_racks import held_rack
 
+COMMANDS = """
+import json, sys
+from tests.tools.command_line import rack
+print(json.dumps([vars(rack(*words)) for words in json.loads(sys.argv[1])]))
+"""
 INSIDE = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc")
 
 
@@ -36,10 +42,11 @@ pytestmark = [
 ]
 
 
-def inside(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a new PID namespace."""
-    command = [*INSIDE, *RACK, *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
+def inside(*commands: tuple[str, ...]) -> list[SimpleNamespace]:
+    """Run commands in a new PID namespace, one after the other in one process."""
+    line = [*INSIDE, sys.executable, "-c", COMMANDS, json.dumps(commands)]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
+    return [SimpleNamespace(**found) for found in json.loads(done.stdout)]
 
 
 @pytest.fixture
@@ -49,26 +56,34 @@ def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         yield process
 
 
-def seen(name: str) -> dict[str, object]:
-    """Return what `rack list` reports about a rack in another PID namespace."""
-    rows = json.loads(inside("list", "--json").stdout)
-    return next(row for row in rows if row["rack"] == name)
+LIST = ("list", "--json")
+CLEAN = ("clean", "--json")
+
+
+def find_row(listed: SimpleNamespace, name: str) -> dict[str, object]:
+    """Return what `rack list` reports about a rack."""
+    return next(row for row in json.loads(listed.stdout) if row["rack"] == name)
 
 
 def test_a_running_rack_is_listed_as_running_never_cleaned_and_can_be_stopped(
     held: subprocess.Popen[bytes], rack_name: str, tmp_path: Path
 ) -> None:
-    row = seen(rack_name)
+    listed, cleaned, refused, status = inside(
+        LIST,
+        CLEAN,
+        ("run", str(tmp_path / "counting.toml"), "--set", f"name={rack_name}"),
+        ("status", rack_name, "--json"),
+    )
+    row = find_row(listed, rack_name)
     assert (row["state"], row["launcher"]) == ("running", None)
     assert str(row["detail"]).endswith("s ago by a process of another PID namespace")
-    assert rack_name in json.loads(inside("clean", "--json").stdout)["in_use"]
-    refused = inside("run", str(tmp_path / "counting.toml"), "--set", f"name={rack_name}")
+    assert rack_name in json.loads(cleaned.stdout)["in_use"]
     assert refused.returncode == 1
     assert "is already running, launched by a process of another PID namespace" in refused.stderr
     # The number of its recorder is that of another process here.
-    assert json.loads(inside("status", rack_name, "--json").stdout)["recording"] is None
+    assert json.loads(status.stdout)["recording"] is None
     assert held.poll() is None
-    stopped = inside("stop", rack_name)
+    (stopped,) = inside(("stop", rack_name))
     assert (stopped.returncode, stopped.stdout) == (0, f"rack '{rack_name}' has ended\n")
     assert rack_name not in list_racks()
     assert held.wait(BOUND_S) == 1
@@ -81,6 +96,7 @@ def test_a_rack_whose_launcher_was_killed_is_listed_as_dead_and_cleaned(
 ) -> None:
     os.kill(held.pid, signal.SIGKILL)
     held.wait(BOUND_S)
-    assert seen(rack_name)["state"] == "dead"
-    assert rack_name in json.loads(inside("clean", "--json").stdout)["removed"]
+    listed, cleaned = inside(LIST, CLEAN)
+    assert find_row(listed, rack_name)["state"] == "dead"
+    assert rack_name in json.loads(cleaned.stdout)["removed"]
     assert rack_name not in list_racks()

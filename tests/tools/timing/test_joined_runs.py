@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from rack.tools.timing.joined_runs import format_joined_runs, measure_joined_run
 from tests.processes import RACK
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
+from tests.warm import run_command
 
 pytestmark = pytest.mark.slow
 
@@ -128,14 +128,7 @@ def run_racks(folder: Path, faults: dict[str, str]) -> dict[str, Path]:
     """Run the three racks in lockstep, and return their recordings."""
     configs = write_configs(folder, faults)
     command = [*RACK, "run", configs["top"], "--lockstep", "--seconds", "3", "--share"]
-    done = subprocess.run(
-        [*command, "--json", "--out", "top"],
-        cwd=folder,
-        timeout=MOST_S,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_command([*command, "--json", "--out", "top"], MOST_S, cwd=folder, text=True)
     assert done.returncode == 0 or faults, done.stdout + done.stderr
     report = json.loads(done.stdout)
     found = {one["rack"].rpartition("-")[2]: folder / one["folder"] for one in report["others"]}

@@ -68,7 +68,7 @@ def test_every_changed_value_has_the_recorded_outcome(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
     tables = assemble(ROOT / "configs" / name, (), None).tables
-    parts: dict[str, object] = {}
+    cases: dict[str, dict[str, object]] = {}
     for path in places(tables):
         changed = deepcopy(tables)
         table: Any = changed
@@ -78,5 +78,6 @@ def test_every_changed_value_has_the_recorded_outcome(
         for value in others(table[path[-1]]):
             table[path[-1]] = value
             found.append(outcome(deepcopy(changed)))
-        parts[".".join(map(str, path))] = found
-    SNAPSHOTS.check(name, parts)
+        case = f"{name}: {'.'.join(map(str, path[:2]))}"
+        cases.setdefault(case, {})[".".join(map(str, path))] = found
+    SNAPSHOTS.check_all(f"{name}: ", cases)

@@ -188,7 +188,7 @@ def disturb(play: Play, events: Events) -> None:
 
 
 @given(EVENTS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(events: Events) -> None:
     play = Play()
     disturb(play, events)
@@ -198,7 +198,7 @@ def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(events: Even
 
 
 @given(EVENTS, SOME_STEPS, SOME_STEPS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_step_that_one_arm_refuses_is_begun_by_none(
     events: Events, puma: frozenset[int], third: frozenset[int]
 ) -> None:
@@ -215,7 +215,7 @@ def test_step_that_one_arm_refuses_is_begun_by_none(
 
 
 @given(EVENTS, st.integers(0, len(STEPS) - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
     events: Events, step: int
 ) -> None:
@@ -227,7 +227,7 @@ def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
 
 
 @given(STEADY, st.sampled_from(ARMS), st.integers(0, 40))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_arm_that_is_launched_again_ends_the_program(events: Events, arm: str, when: int) -> None:
     play = Play()
     disturb(play, events[:when])

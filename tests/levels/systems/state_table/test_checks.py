@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rack.levels.systems.state_table.checks import find_flaws
@@ -110,7 +110,6 @@ def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowCo
 
 
 @pytest.mark.slow
-@settings(deadline=None)
 @given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
 def test_a_table_passes_if_one_row_fires_in_each_case(
     rows: list[tuple[dict[str, set[str]], bool]],

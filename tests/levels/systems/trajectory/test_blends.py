@@ -22,7 +22,7 @@ WITHIN = (1.0, 1.0, 1.0, 1.0, 0.3, 1.0)  # joint 5 is near a limit at home
 
 @pytest.mark.slow
 @given(requests, st.floats(0.1, 4.0), st.sampled_from(["cancel", "hold", "nothing"]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str) -> None:
     rig = TrajectoryRig()
     acted = False

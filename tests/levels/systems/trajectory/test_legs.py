@@ -33,7 +33,7 @@ def test_a_leg_is_smooth_and_passes_its_goal_in_the_middle_of_its_blend() -> Non
 
 @pytest.mark.slow
 @given(parts, parts, st.floats(0.1, 1.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_a_ramp_to_rest_keeps_the_limits(v: list[float], a: list[float], least: float) -> None:
     limits = CELL.limits
     velocity, acceleration = np.array(v) * limits.velocity, np.array(a) * limits.acceleration
