@@ -171,11 +171,11 @@ def _match_messages(
 
 def format_joined_runs(documents: Sequence[Document]) -> Iterator[str]:
     """Yield the verdict on the responses across racks, and lines for each group of paths."""
-    judged = [one for one in documents if one["count"]]
-    counts = Counter(one["holds"] for one in judged)
-    more = [f"{counts[key]} {word}" for key, word in ((False, "failed"), (None, "undecided"))]
-    held = f"{counts[True]} of {len(judged)} responses held their bounds"
-    yield ", ".join([f"across racks: {held}", *(text for text in more if text[0] != "0")])
+    verdicts = Counter(one["holds"] if one["count"] else "not measured" for one in documents)
+    others = {False: "failed", None: "undecided", "not measured": "not measured"}
+    held = f"across racks: {verdicts[True]} of {len(documents)} responses held their bounds"
+    more = [f"{verdicts[key]} {word}" for key, word in others.items() if verdicts[key]]
+    yield ", ".join([held, *more])
     for one in documents:
         levels = " > ".join(one["levels"])
         if not one["count"]:
