@@ -18,6 +18,19 @@ from rack.tools.recording.recording import Recording
 
 
 @dataclass(frozen=True)
+class Difference:
+    """The first difference between two runs.
+
+    Attributes:
+        tick: Release tick of the cycle that wrote the first differing message.
+        mailbox: Mailbox of that message.
+    """
+
+    tick: int
+    mailbox: str
+
+
+@dataclass(frozen=True)
 class DivergentMessage:
     """The first message of a mailbox that differs between two runs.
 
@@ -62,15 +75,16 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
     raise Failure(f"{asked} continues {origin_folder}, but that run no longer exists", 2)
 
 
-def find_first_difference(first_run: Recording, second_run: Recording) -> DivergentMessage | None:
-    """Return the first message that differs between two runs, or None if none differs.
+def find_first_difference(first_run: Recording, second_run: Recording) -> Difference | None:
+    """Return the first difference between two runs, or None if all compared messages are equal.
 
     Only ticks that both runs contain are compared.
 
     Raises:
         Failure: The runs are of different racks, or one of them lacks rows.
     """
-    return next(iter(list_divergent_messages(first_run, second_run)), None)
+    messages = list_divergent_messages(first_run, second_run)
+    return Difference(messages[0].tick, messages[0].mailbox) if messages else None
 
 
 def list_divergent_messages(first_run: Recording, second_run: Recording) -> list[DivergentMessage]:

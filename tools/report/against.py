@@ -10,6 +10,7 @@ from rack.backplane.address_map import CLOCK
 from rack.tools.console.answer import Document, Failure
 from rack.tools.monitor.signals import format_value
 from rack.tools.recording.causes import Clue, Divergence, DivergentCycle, ValueDifference
+from rack.tools.recording.divergence import Difference
 from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
 from rack.tools.report.cycle_again import Repetition, repeat_cycle
@@ -54,7 +55,7 @@ def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
         lines.append(f"{other_run.mailbox} is equal in both")
     return {
         "folder": other_folder,
-        "first_difference": first and {"tick": first.tick, "mailbox": first.mailbox},
+        "first_difference": first and asdict(Difference(first.tick, first.mailbox)),
         "first_miss_tick": first_miss,
         "explained": first is None or (first_miss is not None and first_miss <= first.tick),
         "chain": [asdict(cycle) for cycle in chain],

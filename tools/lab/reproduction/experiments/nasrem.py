@@ -23,7 +23,7 @@ from rack.tools.lab.benches.observed import ObservedRun
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.lab.reproduction.experiments.tasks import TaskRun, summarize_task
 from rack.tools.recording.cycles import Cycles
-from rack.tools.recording.divergence import DivergentMessage, find_first_difference
+from rack.tools.recording.divergence import Difference, find_first_difference
 from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
 from rack.tools.report.analysis import Analysis, compute_due_ns
@@ -150,7 +150,7 @@ class ComparedRun:
     mode: str
     digest: str
     first_miss: int | None
-    difference: DivergentMessage | None
+    difference: Difference | None
 
 
 def _compare_modes(workshop: Workshop) -> tuple[ComparedRun, ...]:
