@@ -29,7 +29,6 @@ from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event, Outcome
 from rack.tools.viewer.window import find_free_port
 from tests.processes import BOUND_S
-from tests.warm import Popen
 
 ROOT = Path(__file__).resolve().parents[3]
 LAUNCH_S = 60.0
@@ -178,7 +177,7 @@ class RackProcess:
         config: Path,
         seconds: float | None,
         *settings: str,
-        popen: Callable[..., subprocess.Popen[str]] = Popen,
+        popen: Callable[..., subprocess.Popen[str]] = subprocess.Popen,
     ) -> None:
         command = [sys.executable, "-m", "tests.boards.lan.racks", str(config), str(seconds or 0)]
         command += settings
