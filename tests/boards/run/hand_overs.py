@@ -133,8 +133,11 @@ class Round:
     def take_over(self) -> None:
         """Take over and publish."""
         self._notes["tries"] += 1
-        # A process that is stopped while it takes over keeps others from doing so.
-        while not self._right.take_over(self._number, HandOver.LOST):
+        # A process that is stopped while it takes over keeps others from doing so. Another one may
+        # have replaced this one at once.
+        while not (
+            self._right.take_over(self._number, HandOver.LOST) or self.writers[-1].claim.is_taken
+        ):
             self._notes["tries"] += 1
             os.sched_yield()
         self._notes["has_claimed"] = 1
