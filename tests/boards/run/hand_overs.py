@@ -284,6 +284,8 @@ class HandOvers:
             process = Round(self._segment, rounds[number], number, bomb)
             process.take_over()
             if bomb.left >= 0:
+                # It made too few stores, and must not be stopped twice.
+                bomb.left = -1
                 os.kill(os.getpid(), kind)
             process.publish(1)
 
