@@ -60,7 +60,7 @@ def _read_stat(pid: int) -> list[str]:
 
 
 def is_ending(pid: int) -> bool:
-    """Check whether a process has ended or runs no more code of its own, because it is being freed.
+    """Check whether a process has ended, or is being removed and no longer runs its own code.
 
     A killed process with much memory remains in state R until its memory is free, for 10 ms or so.
     """

@@ -54,8 +54,8 @@ class SnapshotPolicy:
 
     Attributes:
         part: Snapshots are taken as often as possible, but stop the rack for at most 1 / `part` of
-            the run's time. 0 for no such snapshots. The default keeps their cost below 3 %, as it
-            is about twice the standstill: the processes then copy each page that they write.
+            the run's time. 0 for no such snapshots. A snapshot costs about twice the standstill,
+            because the processes then copy each page that they write.
         every: Number of ticks between additional periodic snapshots, 0 for none.
         at: Tick before which one additional snapshot is taken, None for none.
     """

@@ -34,7 +34,6 @@ class MailboxClaim:
         # The claim is in the segment, even if the slots publish to another head.
         self._box = segment.get_box(name)
         self._lock = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
-        self._epoch = 0
         self.is_taken = False
         self.is_locked = False
         _CLAIMS.add(self)
@@ -70,8 +69,7 @@ class MailboxClaim:
         box = self._box
         # A process that was killed before it stored its claim has used no epoch.
         epoch = get_epoch(box[Box.CLAIMANT] + 1)
-        self._epoch = epoch
-        self.set_begun(head)
+        box[Box.BEGUN + epoch % Box.EPOCHS] = head
         # A reader that finds the new claim must find the word that belongs to it.
         self._slots.fence()
         box[Box.WRITER_PID] = os.getpid()
@@ -85,8 +83,9 @@ class MailboxClaim:
         self.is_taken = True
 
     def set_begun(self, head: int) -> None:
-        """Store the serial of the newest message before the epoch of this claim."""
-        self._box[Box.BEGUN + self._epoch % Box.EPOCHS] = head
+        """Correct the serial of the newest message before the epoch of this claim."""
+        epoch = get_epoch(self._slots.signature)
+        self._box[Box.BEGUN + epoch % Box.EPOCHS] = head
 
     @property
     def is_valid(self) -> bool:

@@ -201,7 +201,7 @@ class Slots:
         # The slot of a lost message still contains an older one, or was never filled. A slot that
         # was cleared has a signature.
         slot = self.heads[head & self.mask]
-        is_cleared = slot[_SERIAL] == 0 != slot[_EPOCH]
+        is_cleared = slot[_SERIAL] == 0 and slot[_EPOCH] != 0
         is_lost = slot[_SERIAL] == head - self.depth and not is_cleared
         is_set_back = newest > head + 1
         is_set_ahead = newest < head and not is_lost

@@ -2,8 +2,8 @@
 
 All copies cycle alike, and the active copy writes. Before each cycle, every other copy compares the
 messages of its last cycle, which it has held back, with the messages of the active copy. If any
-differ, or the active copy has missed the cycle, the copy continues from the active
-copy's message on port `state` (`Executor.realign`), until all messages are equal again.
+differ, or the active copy has missed the cycle, the copy continues from the active copy's message
+on port `state` (`Executor.realign`), until all messages are equal again.
 
 The clock requests a hand-over once the active copy is lost (`rack.boards.run.hand_over`). In
 lockstep the standby then also publishes the messages of its last cycle that the lost copy has not

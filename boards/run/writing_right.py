@@ -54,7 +54,7 @@ class WritingRight:
         """Claim the mailboxes, and become the active copy.
 
         Args:
-            tick: First tick in which this copy writes.
+            tick: First tick at which this copy writes.
             reason: Reason for the hand-over.
 
         Returns:

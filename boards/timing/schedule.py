@@ -100,7 +100,7 @@ def simulate_schedule(
     """Compute the schedule of tasks from time 0.
 
     A job has two context switches, one before its parts and one after them, which appear as idle
-    time. Tasks of equal priority run in the order in which they began to wait. Under ordinary
+    time. Among tasks of equal priority, the one that has waited longest runs first. Under ordinary
     scheduling (priority 0) they take turns of `TURN_NS`.
 
     Args:
@@ -182,9 +182,9 @@ class _TaskSimulation:
         self.task = task
         self.spans: list[Span] = []
         self.ready_at = task.phase_ns
-        # Time from which the task has waited for the core behind others of equal priority, and
-        # under ordinary scheduling the rest of its turn. A late task does not wait for a release,
-        # so it keeps its place.
+        # Time at which the task joined the queue of its priority. A late task does not leave the
+        # queue, so it keeps its place. Under ordinary scheduling, the task also has the rest of its
+        # turn.
         self._queued_at = task.phase_ns
         self._turn_ns = TURN_NS
         self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []

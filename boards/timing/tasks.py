@@ -81,9 +81,9 @@ class TimedTask:
         board: Its board.
         role: "executor", "planner" or "clock".
         core: Its core.
-        priority: SCHED_FIFO priority. A higher one preempts. Tasks of equal priority run in the
-            order in which they began to wait, then of their names. 0 is ordinary scheduling, below
-            all, in which tasks take turns.
+        priority: SCHED_FIFO priority. A higher one preempts. Among tasks of equal priority, the
+            one that has waited longest runs first, and of several the first by name. 0 stands for
+            ordinary scheduling: the task yields to all others and takes turns with its like.
         every_ns: Time between two releases.
         parts: Parts of a job, in order.
         within_cycles: Number of releases that a job may span. The next job is released after them.

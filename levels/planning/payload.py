@@ -289,7 +289,7 @@ class FixedJaw:
                 break
         if travel > SEARCH_RANGE_M:
             return tool
-        across = tool.rotate((0.0, self._side, 0.0))
+        across = tool.rotate_vector((0.0, self._side, 0.0))
         return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
     def _measure_distance(self, row: int, at: Pose) -> float:

@@ -52,7 +52,7 @@ class Pose(NamedTuple):
         """Return the angle between the two orientations, in rad."""
         return norm(self._compute_turn(other))
 
-    def rotate(self, vector: ArrayLike) -> Array:
+    def rotate_vector(self, vector: ArrayLike) -> Array:
         """Return a vector, (3,), that is given in this frame, in the outer frame."""
         rotated = np.zeros(3)
         mujoco.mju_rotVecQuat(rotated, np.array(vector, dtype=float), self.quaternion)
@@ -61,7 +61,7 @@ class Pose(NamedTuple):
     def compute_error(self, target: Pose) -> Array:
         """Return the distance, m, then the rotation, rad, from this pose to `target`, (6,)."""
         return np.concatenate(
-            (target.position - self.position, self.rotate(self._compute_turn(target)))
+            (target.position - self.position, self.rotate_vector(self._compute_turn(target)))
         )
 
     def interpolate_to(self, other: Pose, part: float) -> Pose:

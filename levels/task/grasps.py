@@ -104,7 +104,7 @@ def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
 
 def is_leaning(tool: Pose) -> bool:
     """Return True if a tool does not point straight down."""
-    return bool(1.0 + tool.rotate(UP)[2] > MIN_LEAN)
+    return bool(1.0 + tool.rotate_vector(UP)[2] > MIN_LEAN)
 
 
 def compute_bearing(cell: Cell, position: Array) -> float:

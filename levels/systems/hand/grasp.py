@@ -259,7 +259,7 @@ class GraspExecutor(Executor):
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):
-            return step.model_copy(update={"by": tuple(self._from_world.rotate(step.by))})
+            return step.model_copy(update={"by": tuple(self._from_world.rotate_vector(step.by))})
         if not plan.id:
             return step
         if isinstance(step, CloseStep):
