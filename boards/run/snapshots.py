@@ -78,9 +78,8 @@ class ClockCopies:
     """Takes the snapshots of a rack.
 
     Snapshots are taken as often as possible without stopping the rack for more than 1 /
-    `System.SNAPSHOT_PART` of the time. The first one is taken at once, so that every tick can be
-    reached. Additional snapshots are taken every `System.SNAPSHOT_EVERY` ticks, and before the tick
-    in `System.SNAPSHOT_AT`.
+    `System.SNAPSHOT_PART` of the time. Additional snapshots are taken every `System.SNAPSHOT_EVERY`
+    ticks, and before the tick in `System.SNAPSHOT_AT`.
 
     Attributes:
         cost_s: Time for which the last snapshot stopped the rack.
@@ -91,7 +90,8 @@ class ClockCopies:
         self._segment = segment
         self._driver = driver
         self._copier = copier
-        self._not_before_s = 0.0
+        part = segment.words[System.SNAPSHOT_PART]
+        self._not_before_s = time.monotonic() + FIRST_COST_S * part
         self._taken_at = -sys.maxsize
         self._is_refused = False
 

@@ -57,8 +57,8 @@ DIFFERENCE_CAUSES = (
 class RepeatedRun:
     """The rack of a recorded run, which can be repeated up to any tick.
 
-    A snapshot is taken at each tick reached, so that later ticks are reached faster. If the run
-    continues another run, that one is repeated first. Use it as a context: on exit the `crate` and
+    A snapshot is taken at each tick reached, so that later ticks are reached faster. Ticks before
+    the first snapshot are reached from the beginning of the run. If the run continues another run, that one is repeated first. Use it as a context: on exit the `crate` and
     its snapshots end.
 
     Args:
@@ -202,7 +202,7 @@ class RepeatedRun:
         """Return the nearest state from which the run can be repeated towards `tick`."""
         run = self.recording
         begins = Beginning(crate=self.crate, entries=self.entries)
-        if self._has_begun:
+        if self._has_begun and self._nearest_snapshot_tick(tick) >= 0:
             return replace(begins, continues=self._find_continuation(tick))
         if self._branched_at is not None and self._parent is not None:
             self._parent.reach_tick(self._branched_at)

@@ -59,7 +59,7 @@ def strays(config: RackConfig, seconds: float | None, count: int, expected: str 
         found = []
         for nth, tick in enumerate(ticks):
             wanted = SnapshotPolicy(part=10, at=tick)
-            begins = Continuation(tick, *known) if nth else None
+            begins = Continuation(tick, *known) if min(ticks[:nth], default=tick) < tick else None
             # It has a snapshot there, and goes on to its end.
             with Rack(config, crate=crate, snapshots=wanted, continues=begins) as rack:
                 if rack.run(seconds).digest != outcome.digest:

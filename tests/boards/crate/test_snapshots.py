@@ -371,6 +371,12 @@ def test_a_running_rack_publishes_its_number_of_snapshots(
     assert size >= count * segment // 2
 
 
+def family_of(pid: int) -> set[int]:
+    """Return a process, its children and theirs."""
+    children = list_children(pid)
+    return {pid, *children}.union(*map(list_children, children))
+
+
 @pytest.mark.filterwarnings(FORKS)
 def test_nothing_is_left_of_snapshots_whose_launcher_is_killed(config: MakeConfig) -> None:
     rack = config()
@@ -389,10 +395,9 @@ def test_nothing_is_left_of_snapshots_whose_launcher_is_killed(config: MakeConfi
     with forked(launch) as launcher:
         assert wait_readable(begun, BOUND_S)
         crate = int.from_bytes(os.read(begun, 4), "little")
-        family = {crate, *list_children(crate)}
-        for child in [*family]:
-            family |= list_children(child)
+        # The crate, clock, planner and boards, and the copies that wait in their places.
+        wait_until(lambda: len(family_of(crate)) > 2 * (len(rack.board) + 2))
+        family = family_of(crate)
         os.kill(launcher, signal.SIGKILL)
         wait_until(lambda: not any(map(is_alive, family)))
-    assert len(family) > 2 * (len(rack.board) + 2)
     remove_dead_rack(rack.name)
