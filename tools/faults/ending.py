@@ -106,7 +106,7 @@ def list_strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
     """Return all faults that were injected into a rack, in the order of the fault table."""
     entries = FaultTable(segment).entries
     return tuple(
-        _build_strike(entry, segment.layout, joints)
+        build_strike(entry, segment.layout, joints)
         for entry in entries
         if entry.stage != Stage.FREE
     )
@@ -126,7 +126,7 @@ def read_arm(segment: Segment) -> ArmEnd:
     )
 
 
-def _build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
+def build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
     """Convert an entry of the fault table to a `Strike`."""
     kind = find_kind(entry)
     values = kind.read_parameters(entry)

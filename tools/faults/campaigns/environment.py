@@ -28,9 +28,12 @@ WRITING = ("sh", "-c", "while :; do sync; done")
 
 def list_living_descendants() -> set[int]:
     """Return the process ids of all living descendants of this process except snapshots."""
-    living = {pid for pid in list_descendants(os.getpid()) if is_alive(pid)}
-    # Snapshots end with their crate, which may serve several racks.
-    return {pid for pid in living if not _read_name(pid).startswith(COPY_PREFIX)}
+    return {
+        pid
+        for pid in list_descendants(os.getpid())
+        # Snapshots end with their crate, which may serve several racks.
+        if not _read_name(pid).startswith(COPY_PREFIX) and is_alive(pid)
+    }
 
 
 def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:

@@ -16,7 +16,7 @@ from rack.boards import Rack
 from rack.boards.events import Event
 from rack.boards.faults.kind import DIED, KINDS
 from rack.tools.faults.campaigns.draw import SETTLE_S
-from rack.tools.faults.ending import Strike, list_strikes
+from rack.tools.faults.ending import Strike, build_strike, list_strikes
 from rack.tools.faults.judge import Circumstances, Judge, Judgement, find_end
 
 REPORTS = ("detection", "miss", "reaction", "recovery")
@@ -75,15 +75,17 @@ class Pacer:
         tick = words[System.HELD] - 1
         # Read all events up to this tick.
         self._rack.watch(0.0)
-        struck = list_strikes(self._rack.segment, self._joints)
         # The rack has not ended, but the judge needs to know how far it has run.
         events = [*self._rack.events, Event(0, tick, "end", "", "")]
         waiting = [entry for entry in self._entries if entry.stage == Stage.WAITING]
         if waiting:
-            newest = max(struck, key=lambda strike: strike.began)
-            judge = ForesightedJudge([newest], events, self._run)
+            begun = [entry for entry in self._entries if entry.stage != Stage.WAITING]
+            newest = max(begun, key=lambda entry: entry.tick, default=waiting[0])
+            strike = build_strike(newest, self._run.layout, self._joints)
+            judge = ForesightedJudge([strike], events, self._run)
             self._hold_before(self._advance_faults(waiting, judge, tick))
             return
+        struck = list_strikes(self._rack.segment, self._joints)
         certain_at = ForesightedJudge(struck, events, self._run).find_certain_tick(tick)
         if certain_at is None:
             # The verdict needs the whole run, so do not hold the rack again.
@@ -189,15 +191,18 @@ class ForesightedJudge(Judge):
         (strike,), (judgement,) = self._strikes, self.judge_all().faults
         ends = find_end(strike)
         if _is_handled(judgement):
-            reported = [
-                event.tick
-                for event in self._events
-                if event.kind in REPORTS and event.code not in ASYNCHRONOUS
-            ]
-            return max(ends, *reported) + self.quiet_ticks
+            return max(ends, self._find_last_report()) + self.quiet_ticks
         if tick <= ends < NEVER:
             return ends + self.quiet_ticks
         return tick + max(self.quiet_ticks, (tick - strike.began) // PATIENCE)
+
+    def _find_last_report(self) -> int:
+        """Return the tick of the last report. A handled fault has one."""
+        return max(
+            event.tick
+            for event in self._events
+            if event.kind in REPORTS and event.code not in ASYNCHRONOUS
+        )
 
     def _find_fault_certain_tick(
         self, strike: Strike, judgement: Judgement, tick: int
@@ -215,8 +220,15 @@ class ForesightedJudge(Judge):
         if strike.tick < 0 and ends >= tick:
             return retry_tick
         certain_tick = self._find_last_effect(strike, ends) + 1
+        if not strike.record.consequence.ends_process:
+            # Once the rack has recovered, only late reports of the fault's last effects may follow.
+            quiet_tick = certain_tick - self._compute_recovery(strike)
+            if tick < quiet_tick:
+                return quiet_tick
+            if _is_handled(judgement):
+                certain_tick = max(quiet_tick, self._find_last_report() + self._settle + 1)
         if certain_tick > tick:
-            return certain_tick
+            return min(certain_tick, retry_tick)
         # A planner may detect a fault of its plans, or write its next message, at any later time.
         is_open = self._compute_window(strike)[1] >= tick and judgement.seen != "detected"
         return retry_tick if is_open or not judgement.is_recovered else tick

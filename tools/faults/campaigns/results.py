@@ -112,23 +112,24 @@ def save_result(trial: Trial, path: Path) -> None:
     """Evaluate a trial and atomically write the result and all events to a file."""
     outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
-        "finding": asdict(judge_trial(trial)),
+        "finding": _RESULT.dump_python(judge_trial(trial)),
         "outcome": outcome,
         "refused": trial.refused,
         "levels": trial.levels,
-        "events": [asdict(event) for event in trial.events],
+        "events": _EVENTS.dump_python(trial.events),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, document)
 
 
-_KEPT = TypeAdapter(TrialResult)
+_RESULT = TypeAdapter(TrialResult)
+_EVENTS = TypeAdapter(tuple[Event, ...])
 
 
 def load_result(path: Path) -> TrialResult | None:
     """Load the result from a file. Return None if the file does not exist."""
     try:
-        return _KEPT.validate_python(json.loads(path.read_text())["finding"])
+        return _RESULT.validate_python(json.loads(path.read_text())["finding"])
     except FileNotFoundError:
         return None
 

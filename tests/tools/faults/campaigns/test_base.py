@@ -136,7 +136,9 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
         assert (continued.is_cut, whole.is_cut) == (True, False)
         assert continued.outcome is not None
         assert whole.outcome is not None
-        assert 520 < continued.outcome.ticks < whole.outcome.ticks
+        # The second fault ends at tick 540 and is recovered from, so only late reports may follow:
+        # after a reader's next cycle, and for 0.25 s.
+        assert 540 + 100 < continued.outcome.ticks <= 540 + 100 + 10 < whole.outcome.ticks
         assert continued.start.tick == 300
         # With the events of the faultless rack until then.
         assert min(event.tick for event in continued.events) < 0
