@@ -336,18 +336,17 @@ def load_levels() -> None:
     """Import the levels of NASREM, load their machine code and that for mailboxes, and compile the
     cell, which a crate otherwise does for each rack."""
     from rack.boards.config import load
-    from rack.boards.config.resolved import list_class_names
-    from rack.boards.crate.rack import build_cell_config
+    from rack.boards.crate.rack import build_preload_request
     from rack.boards.run.compiled_mailbox import load_machine_code
     from rack.levels.references import find_class
     from rack.levels.robot.cell import build_cell
 
     load_machine_code()
-    nasrem = load("nasrem")
-    for name in list_class_names(nasrem):
+    nasrem = build_preload_request(load("nasrem"))
+    for name in nasrem.classes:
         level: Any = find_class(name, object, in_child_first=False)
         level.preload()
-    if (cell := build_cell_config(nasrem)) is not None:
+    if (cell := nasrem.cell) is not None:
         build_cell(cell.robot, cell.scene, cell.clock_ns)
 
 

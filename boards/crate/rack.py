@@ -159,9 +159,7 @@ class Rack:
         self._crate = crate = self._crate or CrateLine()
         # The crate imports levels while this process resolves the config, which saves 0.5 s on two
         # cores. If a level's module ends the crate, `resolve` reports which module that is.
-        crate.try_request(
-            Preload(list_class_names(self.config), tuple(sys.path), build_cell_config(self.config))
-        )
+        crate.try_request(build_preload_request(self.config))
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None and (why := self._find_snapshot_obstacle(plan)):
             raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
@@ -371,6 +369,8 @@ class Rack:
         return self._launched
 
 
-def build_cell_config(config: RackConfig) -> CellConfig | None:
-    """Return the tables from which the crate compiles the cell. None without an arm."""
-    return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)
+def build_preload_request(config: RackConfig) -> Preload:
+    """Return the request to import and preload the levels of a rack and to compile its cell."""
+    robot, scene = config.robot, config.scene
+    cell = None if robot is None else CellConfig(robot, scene, config.clock_ns)
+    return Preload(list_class_names(config), tuple(sys.path), cell)

@@ -24,11 +24,9 @@ from rack.backplane.mailbox.history import find_chains
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.config.loader import extend_path, load
-from rack.boards.config.resolved import list_class_names
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
-from rack.boards.crate.rack import build_cell_config
-from rack.boards.crate.requests import Preload
+from rack.boards.crate.rack import build_preload_request
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX
 from rack.boards.events import OF_LAUNCH, Event
 from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
@@ -58,8 +56,8 @@ class RepeatedRun:
     """The rack of a recorded run, which can be repeated up to any tick.
 
     A snapshot is taken at each tick reached, so that later ticks are reached faster. Ticks before
-    the first snapshot are reached from the beginning of the run. If the run continues another run, that one is repeated first. Use it as a context: on exit the `crate` and
-    its snapshots end.
+    the first snapshot are reached from the beginning of the run. If the run continues another run,
+    that one is repeated first. Use it as a context: on exit the `crate` and its snapshots end.
 
     Args:
         recording: The run.
@@ -84,9 +82,7 @@ class RepeatedRun:
         check_code_state(recording, self._error_prefix, anyway)
         self.crate = crate or WarmCrate()
         # The crate imports the levels while this process reads the run.
-        self.crate.try_request(
-            Preload(list_class_names(ran), tuple(sys.path), build_cell_config(ran))
-        )
+        self.crate.try_request(build_preload_request(ran))
         self._has_begun = False
         origin = Origin.read_from(recording)
         self._branched_at = None if origin is None else origin.tick

@@ -16,7 +16,7 @@ from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.faults.campaigns.plan import NOMINAL, Plan
 from rack.tools.faults.campaigns.trial import Start, Trial, run_trial
 
-EVERY_S = 2.0
+EVERY_S = 5.0
 """Simulated time between two snapshots. On average a trial repeats half of it."""
 
 

@@ -132,8 +132,8 @@ class Campaign:
         """
         order = self.order
         self._open_folder()
-        check_violation_counter(self._config)
         with Workers(self._config, self._whole) as self._workers:
+            check_violation_counter(self._config)
             self._progress.begin_run("without faults, in lockstep")
             nominal_runs = self._run_plans([NOMINAL])
             if not nominal_runs:

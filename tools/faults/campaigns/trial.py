@@ -42,8 +42,8 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-RERUN_S = 2.0
-"""Simulated time of the run after a refused launch, in which each task has some cycles."""
+RERUN_CYCLES = 2
+"""Cycles of the slowest level in the run after a refused launch."""
 
 
 class Killer:
@@ -251,7 +251,9 @@ def run_trial(
         trial.run = _collect_circumstances(rack, plan)
     elif plan.faults:
         faultless = replace(plan, faults=())
-        trial.again = run_trial(config, faultless, rack_name, ticks, RERUN_S, crate=crate).outcome
+        period_ticks = max(map(config.find_period, config.board))
+        rerun_s = ((RERUN_CYCLES - 1) * period_ticks + 1) * config.clock_ns * 1e-9
+        trial.again = run_trial(config, faultless, rack_name, ticks, rerun_s, crate=crate).outcome
     trial.start = start
     trial.outcome = rack.outcome
     trial.events = tuple(sorted(rack.events, key=lambda event: event.tick))

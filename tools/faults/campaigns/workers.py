@@ -17,6 +17,7 @@ from pathlib import Path
 from rack.backplane.process import die_with_parent
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
+from rack.boards.crate.rack import build_preload_request
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.base import BaseRack
@@ -65,6 +66,9 @@ class Workers:
             initializer=_prepare_worker,
             initargs=(config, whole, numbers, os.getpid()),
         )
+        for _ in cores:
+            # Start all processes now, so that they import modules while the campaign is prepared.
+            self._pool.submit(_start_crate)
 
     def __enter__(self) -> Workers:
         return self
@@ -128,6 +132,11 @@ class TrialRunner:
         self._crate: WarmCrate | None = None
         self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
+    def start_crate(self) -> None:
+        """Start the crate for trials in lockstep before they are known. It imports the levels."""
+        os.sched_setaffinity(0, {self._core})
+        self._prepare_crate(lockstep=True)
+
     def run_and_save(self, job: TrialJob) -> None:
         """Run a trial and save its result. In lockstep, use one core only."""
         is_lockstep = job.plan.lockstep
@@ -156,6 +165,7 @@ class TrialRunner:
             self._crate = None
         if lockstep and self._crate is None:
             self._crate = WarmCrate()
+            self._crate.try_request(build_preload_request(self._config))
         return self._crate
 
 
@@ -169,6 +179,11 @@ def _prepare_worker(config: RackConfig, whole: bool, cores: SimpleQueue[int], pa
     INTERRUPT.install_handlers()
     die_with_parent(parent)
     _runner = TrialRunner(config, whole, cores.get())
+
+
+def _start_crate() -> None:
+    """Start the crate of a worker process."""
+    _runner.start_crate()
 
 
 def _run_job(job: TrialJob) -> str:
