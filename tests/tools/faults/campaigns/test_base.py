@@ -99,6 +99,7 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
     if not EXHAUSTIVE:
         kinds = random.Random(43).sample(kinds, SAMPLE)
     bench = Bench(config, rack_name, crate)
+    every = round(400 * base_rack.EVERY_S)
     idle = set[str]()
     cut = 0
     for plan in one_of_each(config, kinds):
@@ -110,7 +111,7 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
         if not plan.first_tick:
             assert (continued.start.tick, fault.found_as) == (0, "not armed")
             continue
-        assert continued.start.tick == 800
+        assert continued.start.tick == MOVES // every * every
         cut += continued.is_cut
         if fault.struck < plan.first_tick:
             idle.add(fault.kind)
