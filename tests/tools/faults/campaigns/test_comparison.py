@@ -83,6 +83,9 @@ def test_missing_messages_are_counted_up_to_the_newest(
     standby.take_over()
     standby.write(10)
     assert count_missing_messages(segment, {"writer"}, ()) == 2
+    for _ in range(3):
+        standby.write(10)
+    assert count_missing_messages(segment, {"writer"}, ()) == 0
 
 
 @pytest.mark.slow
