@@ -96,7 +96,7 @@ class SimulatedCores:
                 self._driver.resume_cycle(task)
                 # If the job has missed its deadline, the cycle waits once more.
                 self._driver.resume_cycles(tick)
-                self._add_job(core, job.task, core.now_ns)
+                self._add_job(core, job.task, core.now_ns, after=job)
 
     def _find_scheduler(self, name: str) -> Scheduler:
         """Return the present scheduler of a task. The clock has the first of those on its core."""
@@ -107,13 +107,17 @@ class SimulatedCores:
         schedulers = (self._find_scheduler(other) for other in others if other != CLOCK)
         return max(schedulers, default=Scheduler.FIXED_PRIORITY)
 
-    def _add_job(self, core: SimulatedCore, name: str, ready_at: int) -> None:
+    def _add_job(
+        self, core: SimulatedCore, name: str, ready_at: int, after: CoreJob | None = None
+    ) -> None:
         """Add the job of the release that a task has taken, if there is one.
 
         Args:
             core: Core of the task.
             name: Name of the task.
             ready_at: Time in ns from which the job can run.
+            after: The late job that the task has just ended. The task has not slept since, so it
+                keeps its place in the queue of its priority. None if it was ready or asleep.
         """
         load = self._loads[name]
         clock_ns = self._clock_ns
@@ -129,17 +133,18 @@ class SimulatedCores:
             if block[Block.FINISH] != UNKNOWN:
                 return
             every, cost_ns = task.spec.slice, block[Block.COMPUTING_NS]
-        core.jobs.append(
-            CoreJob(
-                name,
-                release,
-                self._find_scheduler(name),
-                load.priority,
-                load.is_critical,
-                ready_at,
-                deadline_ns=(release + every) * clock_ns,
-                left_ns=cost_ns + load.switch_ns,
-                locked_ns=load.locked_ns,
-                ceiling=load.ceiling,
-            )
+        job = CoreJob(
+            name,
+            release,
+            self._find_scheduler(name),
+            load.priority,
+            load.is_critical,
+            ready_at,
+            deadline_ns=(release + every) * clock_ns,
+            left_ns=cost_ns + load.switch_ns,
+            locked_ns=load.locked_ns,
+            ceiling=load.ceiling,
         )
+        if after is not None:
+            job.ready_at, job.turn_at, job.turn_ns = after.ready_at, after.turn_at, after.turn_ns
+        core.jobs.append(job)

@@ -9,6 +9,7 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import build_rack_timing, resolve
 from rack.boards.errors import ConfigError
+from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.trace_times import compute_response_ns
 from tests.boards.conftest import MakeConfig
 
@@ -48,6 +49,40 @@ params = { process_ms = 0.0 }
 budget = { process_ms = 1.4 }
 """
 """With the clock and all context switches, the tasks need 0.992 of the core."""
+
+EQUALS = """
+format = 2
+name = "equals"
+
+[clock]
+period_ms = 1.0
+mode = "lockstep"
+scheduler = "fixed-priority"
+
+[timing]
+lockstep_load = 1.0
+context_switch_ms = 0.0
+clock_ms = 0.0
+
+[board.one]
+slot = 2
+every = 4
+executor = "rack.levels.systems.figures:FigureLoop"
+priority = 60
+params = { process_ms = 0.0 }
+budget = { process_ms = 2.5 }
+
+[board.two]
+slot = 3
+every = 4
+executor = "rack.levels.systems.figures:FigureLoop"
+priority = 60
+params = { process_ms = 0.0 }
+budget = { process_ms = 2.5 }
+"""
+"""Two tasks of equal priority that need 1.25 of their core."""
+COUNT = 4
+"""Cycles of each task until both wait for the core at a release."""
 
 CRITICAL = 'protocol.mailbox={ "level.plan" = "lock" }'
 ORDINARY = ("board.beside.priority=0", "board.level.planner_priority=0")
@@ -138,6 +173,20 @@ def test_the_longest_response_is_the_predicted_one(config: MakeConfig) -> None:
         for each in predicted:
             if each.task != "clock":
                 assert find_longest_ns(crate, each.task) == each.response_ns
+
+
+@pytest.mark.slow
+def test_a_late_task_goes_on_before_others_of_its_priority(config: MakeConfig) -> None:
+    rack = config(text=EQUALS)
+    chart = simulate_schedule(build_rack_timing(rack, resolve(rack).layout).tasks, 30_000_000)
+    with Rack(rack) as crate:
+        crate.run(0.03)
+        for name in rack.board:
+            rows = open_trace_ring(crate.segment, name).read_new_rows().rows
+            expected = [job.end_ns for job in chart.jobs if job.task == name and job.end_ns]
+            ends = rows["end_ns"] - rows["release_ns"][0]
+            # A job that ends with a tick ends 1 ns before, in it.
+            assert ends[:COUNT] == pytest.approx(expected[:COUNT], abs=1)
 
 
 def test_a_plan_without_a_budget_is_refused(config: MakeConfig) -> None:
