@@ -62,6 +62,7 @@ class Alarm(IntEnum):
     STRAYED = 15  # [task; -]  this copy of a task differs from two others, and is taken out
     # [task, -1: the clock, -2: its standby; HandOver] this copy is active from this tick
     TAKEN_OVER = 14
+    NOT_SWITCHED = 16  # [task; -]  an operator's switch: no standby has the state of this copy
     OPERATOR_GONE = 8  # [entry of the operator table; serial]  a command under a lease: hold
     # Raised by the clock: tasks that miss their cycles.
     LATE = 10  # [task; releases missed]  an executor has not finished before its next release

@@ -62,6 +62,7 @@ EVENT_KINDS: Mapping[Alarm, EventKind] = {
     Alarm.INBOX_FULL: "held",
     Alarm.COMMANDED: "command",
     Alarm.OPERATOR_GONE: "command",
+    Alarm.NOT_SWITCHED: "command",
     Alarm.SCHEDULER_KEPT: "command",
     Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
@@ -73,6 +74,7 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
         Alarm.REJOINED: "'{subject}' rejoined after {span}",
         Alarm.STRAYED: "'{subject}' differs from the two other copies, and is taken out",
         Alarm.TAKEN_OVER: "'{subject}' has taken over: {what}",
+        Alarm.NOT_SWITCHED: "'{subject}' remains active: no standby has its state",
         Alarm.LATE: "'{subject}' missed its deadline: still running at its next release",
         Alarm.PLAN_LATE: "'{subject}' missed its deadline: its plan was not finished",
         Alarm.STARVED: "'{subject}' is not getting its core: {releases} missed since tick {since}",
@@ -254,7 +256,8 @@ class AlarmReader:
             words["what"] = escape_text(f"{code}: {measured}, {detail}")
         else:
             subject = self._name_subject(about, number, owner)
-            board = subject if alarm in (Alarm.REJOINED, Alarm.SCHEDULER_KEPT) else owner
+            is_about_task = alarm in (Alarm.REJOINED, Alarm.NOT_SWITCHED, Alarm.SCHEDULER_KEPT)
+            board = subject if is_about_task else owner
             words |= self._describe_details(alarm, about, row)
         span = self._format_span(value)
         text = text.format(

@@ -107,8 +107,10 @@ class HandOverDirector:
 
     def switch_copy(self, board: str) -> None:
         """Request a hand-over for an operator, if a standby has the state of the active copy."""
-        if board in self._groups:
-            self._hand_over(self._groups[board], HandOver.COMMANDED)
+        group = self._groups.get(board)
+        if group is not None and not self._hand_over(group, HandOver.COMMANDED):
+            tick = self._driver.words[System.TICK]
+            self._driver.alarms.raise_alarm(tick, Alarm.NOT_SWITCHED, group.active.index)
 
     def is_served(self, task: ReleasedTask) -> bool:
         """Return True if another copy does the work of a lost task."""

@@ -54,6 +54,7 @@ KINDS = {
     Alarm.BRAKES_OPENED: "recovery",
     Alarm.RE_REFERENCED: "recovery",
     Alarm.REMOTE_STOP: "command",
+    Alarm.NOT_SWITCHED: "command",
     Alarm.SCHEDULER_KEPT: "command",
     Alarm.PEER_BACK: "recovery",
     Alarm.PEER_RESTARTED: "recovery",

@@ -298,3 +298,14 @@ def test_an_operator_switches_without_a_gap(config: MakeConfig, plain: str) -> N
     assert (task.active.name, task.reason, task.since_tick) == ("wave", "commanded", 90)
     assert task.hand_overs == 2
     assert (digest, alarms) == (plain, [])
+
+
+def test_a_switch_while_no_standby_is_ready_is_reported(config: MakeConfig) -> None:
+    commands = 'command=[{level="wave",what="switch",tick=35}]'
+    struck = faulty(config(STANDBY, commands, text=PLANNED), kill("wave.standby", 30))
+    with Rack(struck) as rack:
+        rack.run(SECONDS)
+        assert list_standbys(rack.segment)[0].hand_overs == 0
+        (event,) = [event for event in rack.events if event.code == "not_switched"]
+    assert (event.tick, event.board, event.kind) == (35, "wave", "command")
+    assert event.text == "'wave' remains active: no standby has its state"
