@@ -11,9 +11,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
 from tests import warm
 
 RACK = (sys.executable, "-m", "rack.tools.cli")
@@ -88,13 +91,17 @@ def start_rack(command: Sequence[str | Path], name: str, log: Path) -> subproces
     with log.open("w") as said:
         process = warm.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
 
-    def has_begun() -> bool:
-        whole, _, _ = log.read_text().rpartition("\n")
-        return any(line.startswith(name) and "tick 0 " not in line for line in whole.splitlines())
-
-    wait_until(lambda: has_begun() or process.poll() is not None, 2 * BOUND_S)
+    wait_until(lambda: is_ticking(name) or process.poll() is not None, 2 * BOUND_S)
     assert process.poll() is None, log.read_text()
     return process
+
+
+def is_ticking(name: str) -> bool:
+    """Return whether a rack has begun to tick."""
+    # It may end, or not be whole yet.
+    with suppress(SegmentError), closing(Segment.attach(name)) as segment:
+        return segment.words[System.TICK] > 0
+    return False
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from rack.backplane.segment import list_racks
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.console.interrupt import list_descendants
-from tests.processes import RACK, runs, wait_until
+from tests.processes import RACK, is_ticking, runs, wait_until
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 from tests.warm import Popen, run_command
@@ -35,10 +35,7 @@ def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Pop
         text=True,
     )
     try:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith(name) and "tick 0 " not in line:
-                break
+        wait_until(lambda: is_ticking(name) or process.poll() is not None, BOUND_S)
         yield process
     finally:
         process.kill()
