@@ -47,7 +47,7 @@ JUDGED = {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load
 def test_a_run_confirms_the_prediction_for_its_rack(
     rack_name: str, tmp_path: Path, figure: str, holds: bool
 ) -> None:
-    run_rack(load(figure, [f"name={rack_name}"]), 1.5, tmp_path / "run", Display())
+    run_rack(load(figure, [f"name={rack_name}"]), 0.7, tmp_path / "run", Display())
     done = rack("analyze", tmp_path / "run", *USUAL, "--out", tmp_path / "out", "--json")
     found = json.loads(done.stdout)
     assert (done.returncode, found["holds"]) == (0 if holds else 1, holds), done.stderr

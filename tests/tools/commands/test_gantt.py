@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
+from rack.tools.console.answer import PIPE_WIDTH
 from tests.tools.command_line import rack
 from tests.tools.recordings import cycle, recorded
 
@@ -54,17 +55,17 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
 
 
 @pytest.mark.slow
-def test_the_rows_of_a_large_rack_are_not_wrapped_in_a_pipe(tmp_path: Path) -> None:
-    shown = rack("gantt", "nasrem", "--out", tmp_path).stdout.splitlines()
+def test_the_rows_of_a_large_rack_are_not_wrapped_and_its_times_are_written_in_full(
+    tmp_path: Path,
+) -> None:
+    window = ("--from-ms", 100_000, "--to-ms", 100_040)
+    shown = rack("gantt", "nasrem", *window, "--out", tmp_path).stdout.splitlines()
+    assert max(map(len, shown)) <= PIPE_WIDTH
     lanes = [line for line in shown if line.startswith("core ")]
     assert len(lanes) == 6
     assert all(re.fullmatch(r"core \d  \w+ +[A-Z.-]{40,76}", line) for line in lanes)
-
-
-@pytest.mark.slow
-def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(tmp_path: Path) -> None:
-    rack("gantt", "nasrem", "--from-ms", 100_000, "--to-ms", 100_040, "--out", tmp_path)
-    # matplotlib draws letters as shapes, and names each text in a comment.
+    # matplotlib draws letters as shapes, and names each text in a comment. They are far enough
+    # apart.
     labels = re.findall(r"<!-- ([\d.+e]+) -->", (tmp_path / "gantt.svg").read_text())
     assert labels == ["100000", "100020", "100040"]
 

@@ -111,7 +111,7 @@ def measured_run(
         f"clock.mode={request.param}",
         "board.level.params.process_ms=1.0",
     ]
-    assert run_rack(load("fig2", settings), 2.0, folder, Display()).outcome.cause == "time over"
+    assert run_rack(load("fig2", settings), 0.8, folder, Display()).outcome.cause == "time over"
     return Recording(folder)
 
 

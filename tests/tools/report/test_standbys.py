@@ -54,7 +54,14 @@ def test_the_viewer_has_a_lane_of_active_copies(
     assert [*zip(lane.ticks.tolist(), lane.values.ravel().tolist(), strict=True)] == copies
 
 
-@pytest.mark.parametrize("tick", [LOWER_LOST_AT - 1, LOWER_LOST_AT + 40, CLOCK_LOST_AT + 40])
+@pytest.mark.parametrize(
+    "tick",
+    [
+        pytest.param(LOWER_LOST_AT - 1, marks=pytest.mark.thorough),
+        LOWER_LOST_AT + 40,
+        CLOCK_LOST_AT + 40,
+    ],
+)
 def test_a_run_continues_a_run_with_hand_overs_to_its_digest(
     run: Path, tmp_path: Path, tick: int
 ) -> None:

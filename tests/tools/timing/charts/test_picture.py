@@ -37,9 +37,9 @@ def spans_ns(panel: Panel, letter: str) -> list[tuple[int, int]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end_ms", [2.0, 50.0])
-def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
-    panel = build_panel("nasrem", 0.0, end_ms)
+@pytest.mark.parametrize(("rack", "end_ms"), [("fig2", 2.0), ("nasrem", 50.0)])
+def test_a_letter_is_no_wider_than_its_span(rack: str, end_ms: float) -> None:
+    panel = build_panel(rack, 0.0, end_ms)
     texts, figure = draw_texts(panel)
     to_data = figure.axes[0].transData.inverted()
     letters = [text for text in texts if text.get_text() in {unit.value for unit in Unit}]
