@@ -53,7 +53,10 @@ def test_the_written_files_run_and_pass_their_tests(name: str, tmp_path: Path) -
         done = rack("new", kind, each, folder=tmp_path)
         hint = f"  rack run {each}/{each}.toml --lockstep --seconds 2\n  pytest {each}\n"
         assert hint in done.stdout
-        run = [*("run", f"{each}/{each}.toml", "--lockstep", "--seconds", "0.5", "--no-record")]
+        if kind == "level":
+            # The next test runs one.
+            continue
+        run = [*("run", f"{each}/{each}.toml", "--lockstep", "--seconds", "0.2", "--no-record")]
         done = rack(*run, folder=tmp_path)
         assert done.returncode == 0, done.stdout + done.stderr
     test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *names]

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.events import Event
 from rack.tools.recording.checksums import format_checked_line
@@ -187,9 +188,9 @@ def test_of_a_running_rack_the_recording_so_far_is_plotted(tmp_path: Path, rack_
 
 
 @pytest.mark.slow
-def test_a_rack_that_is_not_recorded_is_refused(tmp_path: Path, rack_name: str) -> None:
-    with held_rack(tmp_path, rack_name):
-        shown = rack("plot", rack_name, "counter.status.row")
+def test_a_rack_that_is_not_recorded_is_refused(small: Path, rack_name: str) -> None:
+    with Rack(load(small, [f"name={rack_name}"])):
+        shown = rack("plot", rack_name, COUNT)
     assert (shown.returncode, shown.stderr) == (
         1,
         f"{rack_name}: the rack is not recorded; 'rack record {rack_name}' records it\n",

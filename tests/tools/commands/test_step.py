@@ -36,7 +36,7 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_held_rack_is_stepped_by_cycles_and_ticks(
+def test_a_held_rack_is_stepped_released_held_again_and_ends_in_order(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
@@ -56,10 +56,18 @@ def test_a_held_rack_is_stepped_by_cycles_and_ticks(
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
     assert f"HELD: 'rack step {rack_name}' continues it" in rack("status", rack_name).stdout
+    assert rack("resume", rack_name).stdout == f"rack '{rack_name}' continues\n"
+    words = Segment.attach(rack_name).words
+    wait_until(lambda: words[System.TICK] > 150 and not words[System.HELD])
+    first, _ = stepped(rack_name, "--ticks", "1")
+    assert stepped(rack_name, "--ticks", "1")[0] == first + 1
+    assert rack("stop", rack_name).returncode == 0
+    assert held.wait(BOUND_S) == 1
+    assert rack("step", rack_name).returncode == 1
 
 
 @pytest.mark.slow
-def test_requests_to_a_held_rack_wait_until_it_continues(
+def test_requests_to_a_held_rack_wait_until_it_continues_and_it_ends_with_its_launcher(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' continues it"
@@ -80,25 +88,8 @@ def test_requests_to_a_held_rack_wait_until_it_continues(
         f"rack '{rack_name}': emergency stop reset at tick 8; the arm"
         f" {waits.replace('tick 0', 'tick 9')}\n"
     )
-
-
-@pytest.mark.slow
-def test_a_released_rack_can_be_held_again_and_ends_in_order(
-    held: subprocess.Popen[bytes], rack_name: str
-) -> None:
-    assert rack("resume", rack_name).stdout == f"rack '{rack_name}' continues\n"
-    words = Segment.attach(rack_name).words
-    wait_until(lambda: words[System.TICK] > 100 and not words[System.HELD])
-    first, _ = stepped(rack_name, "--ticks", "1")
-    assert stepped(rack_name, "--ticks", "1")[0] == first + 1
-    assert rack("stop", rack_name).returncode == 0
-    assert held.wait(BOUND_S) == 1
-    assert rack("step", rack_name).returncode == 1
-
-
-@pytest.mark.slow
-def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[bytes], rack_name: str) -> None:
-    clock = Segment.attach(rack_name).words[System.CLOCK_PID]
+    # Held, it ends with its launcher.
+    clock = segment.words[System.CLOCK_PID]
     os.kill(held.pid, signal.SIGKILL)
     wait_until(lambda: not Path(f"/proc/{clock}").exists(), BOUND_S)
     assert rack("step", rack_name).returncode == 1

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
 
@@ -21,42 +23,61 @@ from tests.tools.command_line import rack
 from tests.tools.held_racks import held_rack
 
 
+@contextmanager
+def held_before_tick_20(folder: Path, name: str) -> Iterator[str]:
+    """Hold a counting rack, and yield its name."""
+    with held_rack(folder, name):
+        assert rack("step", name, "--ticks", "20").returncode == 0
+        yield name
+
+
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[str]:
-    """Name of a counting rack, held before tick 20."""
-    with held_rack(tmp_path, rack_name):
-        assert rack("step", rack_name, "--ticks", "20").returncode == 0
-        yield rack_name
+    """Name of a counting rack that a test may continue."""
+    with held_before_tick_20(tmp_path, rack_name) as name:
+        yield name
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Name of a counting rack that stays held."""
+    folder = tmp_path_factory.mktemp("still")
+    with held_before_tick_20(folder, f"test-still-{os.getpid()}") as name:
+        yield name
 
 
 @pytest.mark.slow
-def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None:
-    listed = json.loads(rack("mailbox", held, "--json").stdout)
+def test_mailboxes_are_listed_and_their_newest_messages_shown(still: str) -> None:
+    listed = json.loads(rack("mailbox", still, "--json").stdout)
     (counter,) = [row for row in listed if row["mailbox"] == "counter.status"]
     assert (counter["writer"], counter["period_ms"], counter["written"]) == ("counter", 10.0, 5)
-    assert "counter.status" in rack("mailbox", held).stdout
-    newest = json.loads(rack("mailbox", held, "counter.status", "--json").stdout)
+    assert "counter.status" in rack("mailbox", still).stdout
+    newest = json.loads(rack("mailbox", still, "counter.status", "--json").stdout)
     # Released at ticks 0, 4, ..., 16; the rack is at tick 19.
     assert (newest["serial"], newest["tick"], newest["age_ticks"]) == (5, 16, 3)
     assert newest["fields"]["fired"] == "count up"
     assert newest["fields"]["state"] == "executing"
-    text = rack("mailbox", held, "counter.status").stdout
+    text = rack("mailbox", still, "counter.status").stdout
     assert text.startswith("counter.status: serial 5, of tick 16, 3 ticks (7.5 ms) old\n")
 
 
 @pytest.mark.slow
-def test_an_unknown_name_is_reported_in_one_line(held: str, tmp_path: Path) -> None:
-    never = ("watch", held, "counter.status.row", "--when", "counter.status.row > 99")
+def test_an_unknown_name_is_reported_in_one_line(still: str, tmp_path: Path) -> None:
+    never = ("watch", still, "counter.status.row", "--when", "counter.status.row > 99")
     cases = {
-        ("mailbox", held, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
-        ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
-        ("watch", held, "counter.status.rwo"): "counter.status.rwo: no such signal; nearest: count",
-        ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
-        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: must be a time, ",
-        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: must be a time, ",
+        ("mailbox", still, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
+        ("mailbox", still, "--watch"): "--watch needs the NAME of a mailbox",
+        (
+            "watch",
+            still,
+            "counter.status.rwo",
+        ): "counter.status.rwo: no such signal; nearest: ",
+        ("watch", still, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
+        ("watch", still, "counter.status.row", "--every", "1"): "--every 1: must be a time, ",
+        ("watch", still, "counter.status.row", "--after", "9e3s"): "--after 9e3s: must be a time, ",
         (*never, "--out", "missing/x.csv"): '"missing/x.csv": No such file or directory',
         (*never, "--out", "."): '".": Is a directory',
-        ("watch", held, "counter.status.row", "--when", "counter.status.row > nan"): (
+        ("watch", still, "counter.status.row", "--when", "counter.status.row > nan"): (
             '"counter.status.row > nan": nothing can be compared with nan'
         ),
     }

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -23,7 +23,36 @@ from tests.boards.remembering_racks import REMEMBERING
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
-SECONDS = 1.0
+SECONDS = 0.5
+WAVES = f"""{REMEMBERING}
+[board.second]
+slot = 4
+rate_hz = 400
+executor = "wave_levels:Wave"
+
+[board.third]
+slot = 5
+rate_hz = 400
+executor = "wave_levels:Wave"
+"""
+FAULTS = """
+[[fault]]
+kind = "kill"
+board = "wave"
+tick = 130
+
+[[fault]]
+kind = "corrupt"
+board = "second"
+tick = 130
+cycles = 4
+
+[[fault]]
+kind = "delay"
+board = "third"
+tick = 130
+cycles = 4
+"""
 OWN_LEVEL = """
 from time import monotonic_ns
 import numpy as np
@@ -43,7 +72,7 @@ class Summing(Executor):
 
     def process(self, tick):
         self._sum += 1.0
-        self.sum.value[1] = self._sum if tick < 250 else AFTER
+        self.sum.value[1] = self._sum if tick < 120 else AFTER
 
 
 class Passing(Executor):
@@ -74,11 +103,10 @@ below = "adding"
 executor = "{module}:Passing"
 """
 Run = Callable[..., Recording]
-Runs = tuple[Run, Recording, Recording]
 
 
 def run_in(folder: Path, rack_name: str) -> Run:
-    """Return a function that runs a rack for a second, and records it."""
+    """Return a function that runs a rack for `SECONDS`, and records it."""
 
     def run(name: str, text: str, *settings: str, faults: str = "") -> Recording:
         file = folder / f"{name}.toml"
@@ -98,11 +126,24 @@ def ran(rack_name: str, tmp_path: Path) -> Run:
     return run_in(tmp_path, rack_name)
 
 
+class Runs(NamedTuple):
+    """Runs of the same rack: one, with another parameter, with faults; and one of another rack."""
+
+    one: Recording
+    changed: Recording
+    faulty: Recording
+    commanded: Recording
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
-    """A function that runs the same rack again, a run, and a run with another parameter."""
     run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
-    return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
+    return Runs(
+        run("one", WAVES),
+        run("two", WAVES, "board.wave.params.factor=2"),
+        run("faulty", WAVES, faults=FAULTS),
+        run("commanded", COMMANDED),
+    )
 
 
 def explain_difference(
@@ -124,7 +165,7 @@ def _losing(run: Recording) -> Path:
 
 
 def test_equal_runs_have_no_chain(runs: Runs, tmp_path: Path) -> None:
-    _, one, _ = runs
+    one = runs.one
     again = Recording(Path(shutil.copytree(one.folder, tmp_path / "again")))
     found = explain_difference(one, again)
     assert (found["first_difference"], found["chain"], found["repetition"]) == (None, [], None)
@@ -132,8 +173,7 @@ def test_equal_runs_have_no_chain(runs: Runs, tmp_path: Path) -> None:
 
 
 def test_a_parameter_is_named_with_the_attributes_that_it_changed(runs: Runs) -> None:
-    _, one, two = runs
-    found = explain_difference(two, one)
+    found = explain_difference(runs.changed, runs.one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (0, "wave.status", "wave")
     assert (cycle["read"], cycle["unequal"]) == ((), "")
@@ -148,7 +188,7 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(runs: Runs) ->
 def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     runs: Runs, tmp_path: Path
 ) -> None:
-    _, one, _ = runs
+    one = runs.one
     config = load_branch_config(one, ["board.wave.params.factor=2"], None)
     with RepeatedRun(one) as again:
         run_rack(config, SECONDS, tmp_path / "two", Display(), beginning=again.continue_at(150))
@@ -163,29 +203,27 @@ def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
 
 
 @pytest.mark.parametrize(
-    ("kind", "more", "field", "kinds"),
+    ("board", "field", "kinds"),
     [
-        ("kill", "", "tick", {"fault", "died", "skipped"}),
-        ("corrupt", "cycles = 4", "tick", {"fault"}),
-        ("delay", "cycles = 4", "visible_at", {"fault"}),
+        ("wave", "tick", {"fault", "died", "skipped"}),
+        ("second", "tick", {"fault"}),
+        ("third", "visible_at", {"fault"}),
     ],
+    ids=["kill", "corrupt", "delay"],
 )
 def test_a_fault_is_the_cause_and_nothing_is_repeated(
-    runs: Runs, kind: str, more: str, field: str, kinds: set[str]
+    runs: Runs, board: str, field: str, kinds: set[str]
 ) -> None:
-    again, one, _ = runs
-    fault = f"[[fault]]\nkind = '{kind}'\nboard = 'wave'\ntick = 130\n{more}\n"
-    two = again(kind, REMEMBERING, faults=fault)
-    found = explain_difference(one, two)
+    found = explain_difference(runs.one, runs.faulty, of=f"{board}.status")
     (cycle,) = found["chain"]
-    assert (cycle["tick"], cycle["mailbox"]) == (130, "wave.status")
+    assert (cycle["tick"], cycle["mailbox"]) == (130, f"{board}.status")
     assert cycle["fields"][0]["name"] == field
     assert {clue["kind"] for clue in cycle["clues"]} == kinds
-    assert {clue["run"] for clue in cycle["clues"]} == {str(two.folder)}
+    assert {clue["run"] for clue in cycle["clues"]} == {str(runs.faulty.folder)}
     assert (found["repetition"], found["not_repeated"]) == (None, "")
     # The chain leads from the watching level, which noticed a loss, to the killed board.
     if "died" in kinds:
-        away = explain_difference(one, two, of="watch.status")["chain"]
+        away = explain_difference(runs.one, runs.faulty, of="watch.status")["chain"]
         assert [cycle["mailbox"] for cycle in away] == ["watch.status", "wave.status"]
         assert away[0]["unequal"] == "wave.status"
 
@@ -199,8 +237,8 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     two = ran("two", text)
     found = explain_difference(one, two)
     (cycle,) = found["chain"]
-    assert (cycle["tick"], cycle["writer"]) == (250, "adding")
-    assert cycle["fields"] == ({"name": "adding.sum.value[1]", "here": 251.0, "there": 252.0},)
+    assert (cycle["tick"], cycle["writer"]) == (120, "adding")
+    assert cycle["fields"] == ({"name": "adding.sum.value[1]", "here": 121.0, "there": 122.0},)
     assert cycle["clues"] == ()
     repetition = found["repetition"]
     assert (repetition["because"], repetition["runs"]) == ("code", (str(one.folder),))
@@ -211,8 +249,8 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     assert places == [("passing.sum", "adding.sum"), ("adding.sum", "")]
 
 
-def test_an_operators_command_is_the_cause(ran: Run) -> None:
-    one = ran("one", COMMANDED)
+def test_an_operators_command_is_the_cause(runs: Runs, ran: Run) -> None:
+    one = runs.commanded
     two = ran("two", COMMANDED, commands("level = 'upper', what = 'hold', tick = 80"))
     (cycle,) = explain_difference(one, two)["chain"]
     assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (80, "upper.operator", "clock")
@@ -224,17 +262,16 @@ def test_an_operators_command_is_the_cause(ran: Run) -> None:
 
 
 def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
-    runs: Runs, ran: Run, tmp_path: Path
+    runs: Runs, tmp_path: Path
 ) -> None:
-    _, one, two = runs
+    one, two = runs.one, runs.changed
     done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
     assert "  - not repeated: --repeat runs both racks again, up to that cycle" in done.stdout
     assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
-    other = ran("other", COMMANDED)
     against = (one.folder, "--against")
     for arguments, said in (
-        ((*against, other.folder), "are of different racks: only the first has 'wave'"),
+        ((*against, runs.commanded.folder), "are of different racks: only the first has "),
         ((*against, tmp_path), "not a run"),
         ((*against, _losing(two)), "lost 3 rows; the two runs cannot be compared"),
         ((*against, two.folder, "--of", "wave.statu"), "nearest: wave.status"),

@@ -249,12 +249,12 @@ def test_a_report_shows_who_held_a_level_and_what_is_still_held(
         "level='lower', what='hold', tick=301",
     )
     config = load(tmp_path / "commanded.toml", [f"name={rack_name}", given])
-    run_rack(config, 32.0, tmp_path / "run", Watchful())
+    run_rack(config, 20.0, tmp_path / "run", Watchful())
     report, text = write_report(tmp_path / "run")
     keys = ("level", "by", "why", "since_s", "until_s", "lasted_s")
     assert [[hold[key] for key in keys] for hold in report["holds"]] == [
         ["upper", "operator", "hold", 0.26, 0.52, 0.26],
-        ["lower", "operator", "hold", 0.755, None, 31.2425],
+        ["lower", "operator", "hold", 0.755, None, 19.2425],
     ]
     assert "## Holds, longest first: 2" in text.splitlines()
     release = f"rack command {rack_name} lower resume"

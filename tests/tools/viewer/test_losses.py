@@ -15,24 +15,24 @@ from rack.tools.monitor.display import Display
 from rack.tools.viewer.reading import EntityRows, read_component
 from rack.tools.viewer.style import LOST
 
-LOST_AT = (400, 1000)
+LOST_AT = (200, 600)
 """Ticks at which the servo board is killed and hangs."""
 STATE = "StateChange:state"
 FAULTS = """
 [[fault]]
 kind = "kill"
 board = "servo"
-at = 1.0
+at = 0.5
 
 [[fault]]
 kind = "hang"
 board = "servo"
-at = 2.5
+at = 1.5
 
 [[fault]]
 kind = "kill"
 board = "world"
-at = 1.0
+at = 0.5
 """
 
 
@@ -42,7 +42,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     faults = folder / "faults.toml"
     faults.write_text(FAULTS)
     config = load("nasrem", [f"name=test-losses-{os.getpid()}", "clock.mode=lockstep"], faults)
-    run_rack(config, 4.0, folder / "run", Display())
+    run_rack(config, 2.8, folder / "run", Display())
     return folder / "run" / "run.rrd"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -120,27 +121,29 @@ def test_the_uncertainty_of_times_is_in_the_log(merged_file: Path) -> None:
     assert line.endswith(" ms")
 
 
-@pytest.fixture
-def branched_runs(rack_name: str, tmp_path: Path) -> Path:
-    """The folder of two runs: "whole", and "other", which branches off at tick 150."""
-    file = tmp_path / "remembering.toml"
+@pytest.fixture(scope="module")
+def branched_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of two runs: "whole", and "other", which branches off at tick 150; and of the
+    file in which both are, "both.rrd"."""
+    folder = tmp_path_factory.mktemp("branched")
+    file = folder / "remembering.toml"
     file.write_text(REMEMBERING)
-    config = load(file, [f"name={rack_name}"])
-    run_rack(config, 1.0, tmp_path / "whole", Display())
-    whole = Recording(tmp_path / "whole")
+    config = load(file, [f"name=test-branched-{os.getpid()}"])
+    run_rack(config, 0.75, folder / "whole", Display())
+    whole = Recording(folder / "whole")
     config = load_branch_config(whole, ["board.wave.params.factor=2"], None)
     with RepeatedRun(whole) as again:
-        run_rack(config, 1.0, tmp_path / "other", Display(), beginning=again.continue_at(150))
-    return tmp_path
+        run_rack(config, 0.75, folder / "other", Display(), beginning=again.continue_at(150))
+    names = ("other", "--against", "whole", "--out", "both.rrd")
+    done = rack("replay", *names, folder=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
 
 
 @pytest.mark.slow
 def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     branched_runs: Path,
 ) -> None:
-    names = ("other", "--against", "whole", "--out", "both.rrd")
-    done = rack("replay", *names, folder=branched_runs)
-    assert done.returncode == 0, done.stderr
     merged_file = branched_runs / "both.rrd"
     curves = [
         read_component(merged_file, f"/{run}/signals/wave.status/value")
@@ -156,8 +159,17 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
         (150, "tick 150: other branches off"),
         (150, "tick 150: other differs from whole: wave.status"),
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "view", [None, pytest.param("log of all runs", marks=pytest.mark.thorough)]
+)
+def test_no_view_of_a_branch_and_its_run_fails_in_the_viewer(
+    branched_runs: Path, view: str | None
+) -> None:
     try:
-        for view in (None, "log of all runs"):
-            assert draw_picture([merged_file], 0.5, view).complaints == []
+        picture = draw_picture([branched_runs / "both.rrd"], 0.5, view)
     except NoViewerError as error:
         pytest.skip(str(error))
+    assert picture.complaints == []
