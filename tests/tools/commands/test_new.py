@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
@@ -47,23 +48,35 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 
 
 @pytest.mark.slow
-def test_the_written_files_run_and_pass_their_tests(name: str, tmp_path: Path) -> None:
-    names = [f"{name}_{kind}" for kind in KINDS]
-    for kind, each in zip(KINDS, names, strict=True):
+@pytest.mark.parametrize("kind", ["servo", "planner"])
+def test_the_written_files_run(kind: str, name: str, tmp_path: Path) -> None:
+    """The next test but one runs a level."""
+    assert rack("new", kind, name, folder=tmp_path).returncode == 0
+    run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "0.2", "--no-record")]
+    done = rack(*run, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kinds",
+    # A planner comes with an executor.
+    [("planner",), pytest.param(KINDS, marks=pytest.mark.thorough)],
+    ids=["planner", "all"],
+)
+def test_the_written_files_pass_their_tests(
+    kinds: Sequence[str], name: str, tmp_path: Path
+) -> None:
+    names = [f"{name}_{kind}" for kind in kinds]
+    for kind, each in zip(kinds, names, strict=True):
         done = rack("new", kind, each, folder=tmp_path)
         hint = f"  rack run {each}/{each}.toml --lockstep --seconds 2\n  pytest {each}\n"
         assert hint in done.stdout
-        if kind == "level":
-            # The next test runs one.
-            continue
-        run = [*("run", f"{each}/{each}.toml", "--lockstep", "--seconds", "0.2", "--no-record")]
-        done = rack(*run, folder=tmp_path)
-        assert done.returncode == 0, done.stdout + done.stderr
     test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *names]
     tested = subprocess.run(
         test, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S, check=False
     )
-    assert "3 passed" in tested.stdout, tested.stdout + tested.stderr
+    assert f"{len(kinds)} passed" in tested.stdout, tested.stdout + tested.stderr
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.shared_runs import nasrem_run
+from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
 NO_DRIVER = {
@@ -19,23 +19,23 @@ NO_DRIVER = {
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return nasrem_run(tmp_path_factory)
+    return small_run(tmp_path_factory)
 
 
 @pytest.mark.slow
 def test_the_first_view_and_one_of_its_views_are_drawn(run: Path, tmp_path: Path) -> None:
     # A run of a flight recorder has no run.rrd.
     (run / "run.rrd").rename(tmp_path / "run.rrd")
-    shown = rack("picture", run, "--at", 6)
+    shown = rack("picture", run, "--at", 3)
     (tmp_path / "run.rrd").rename(run / "run.rrd")
     if shown.stderr.startswith("no picture: "):
         pytest.skip(shown.stderr)
-    assert shown.stdout.splitlines()[0] == f"picture: {run / 'picture-6s.png'}"
+    assert shown.stdout.splitlines()[0] == f"picture: {run / 'picture-3s.png'}"
     path = tmp_path / "ages.png"
     # This view is in a tab behind another one.
-    shown = rack("picture", run, "--at", 6, "--view", "plan age", "--out", path)
+    shown = rack("picture", run, "--at", 3, "--view", "plan age", "--out", path)
     assert (shown.returncode, shown.stderr.splitlines()[1:]) == (0, [])
-    with Image.open(run / "picture-6s.png") as whole, Image.open(path) as part:
+    with Image.open(run / "picture-3s.png") as whole, Image.open(path) as part:
         assert part.width < whole.width
         assert len(part.convert("RGB").getcolors(1 << 24) or ()) > 10
 
@@ -57,8 +57,8 @@ def test_without_a_driver_the_cause_and_what_to_do_are_one_line(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--at", "7"), "--at 7.0: must be 0 to 6.4975 s"),
-        (("--at", "nan"), "--at nan: must be 0 to 6.4975 s"),
+        (("--at", "4"), "--at 4.0: must be 0 to 3.9975 s"),
+        (("--at", "nan"), "--at nan: must be 0 to 3.9975 s"),
         (("--at", "1", "--out", "a.jpg"), "--out a.jpg: the name of a picture must end in .png"),
         (("--at", "1", "--out", "nowhere/a.png"), '"nowhere/a.png": No such file or directory'),
     ],
