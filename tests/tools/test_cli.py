@@ -153,7 +153,8 @@ def test_with_stdin_closed_a_command_that_reads_it_says_so(
 
 @pytest.mark.slow
 def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str) -> None:
-    for arguments in outputs(small, rack_name):
+    # One that fails and one that starts processes.
+    for arguments in outputs(small, rack_name)[-2:]:
         # Python itself closes what the shell has closed before it starts.
         line = ["sh", "-c", '"$@" >&-', "sh", *RACK, *arguments]
         done = run_process(line)

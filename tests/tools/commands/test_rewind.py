@@ -24,13 +24,13 @@ from tests.processes import descriptors
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
-SECONDS = 2.0
+SECONDS = 1.25
 DIGITS = "9" * 400
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 800 ticks."""
+    """A run of 500 ticks."""
     folder = tmp_path_factory.mktemp("rewound")
     path = folder / "remembering.toml"
     path.write_text(REMEMBERING)
@@ -76,7 +76,7 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
     assert first["fields"]["value"] == found[2]["value"] == value[479]
     assert [one["tick"] for one in found[3:6]] == [481, 491, 488]
     assert found[6]["value"]["fields"]["value"] == value[487]
-    assert found[8]["error"].startswith("-0.0025: must be 0 to 1.9975 s")
+    assert found[8]["error"].startswith("-0.0025: must be 0 to 1.2475 s")
     assert "wave.status: no message yet at 0 s" in found[9]["error"]
     # Nothing is done after quit.
     assert len(found) == 10
@@ -165,7 +165,7 @@ def test_a_branch_may_begin_while_a_cycle_is_late(
     path, run = tmp_path / "late.toml", tmp_path / "run"
     fault = '[[fault]]\nkind = "overrun"\nboard = "watch"\ntick = 100\nfor = 0.25\nby = 2.0\n'
     path.write_text(REMEMBERING + fault)
-    run_rack(load(path, [f"name=test-late-{tmp_path.name[-20:]}"]), 1.0, run, Display())
+    run_rack(load(path, [f"name=test-late-{tmp_path.name[-20:]}"]), 0.5, run, Display())
     # The cycle that was released at tick 104 ends after tick 110.
     branch = tmp_path / "branch"
     found = Asked(run, monkeypatch)("goto 0.275", f"branch --out {branch}")[-1]
@@ -179,13 +179,13 @@ def test_a_mistake_is_reported_in_one_line_with_the_usage(asked: Asked) -> None:
     lines = {
         "goot 3": "goot: no such command; nearest: goto",
         "goto": 'goto: usage: goto TIME, as in 12.5; or goto --when "',
-        "goto soon": "soon: must be 0 to 1.9975 s",
-        "goto nan": "nan: must be 0 to 1.9975 s",
+        "goto soon": "soon: must be 0 to 1.2475 s",
+        "goto nan": "nan: must be 0 to 1.2475 s",
         "step x": "step: argument ticks: x: must be -1000000000000000 to 1000000000000000 ticks",
         f"step {DIGITS}": f"{DIGITS[:40]}",
         f"back -{DIGITS}": "must be -1000000000000000 to 1000000000000000 ticks",
-        f"goto {DIGITS}": "must be 0 to 1.9975 s",
-        f"goto -{DIGITS}": "must be 0 to 1.9975 s",
+        f"goto {DIGITS}": "must be 0 to 1.2475 s",
+        f"goto -{DIGITS}": "must be 0 to 1.2475 s",
         f"events {DIGITS}": "must be 0 to 1e+09 s",
         f"branch --seconds {DIGITS}": "must be 0 to 1e+09 s",
         f"branch --set seed={DIGITS}": "integer too long: the limit is 64 bits",
@@ -216,5 +216,5 @@ def test_a_script_without_json_prints_text(run: Path, monkeypatch: pytest.Monkey
     lines = done.stdout.splitlines()
     assert lines[0] == "1.2 s, tick 480"
     assert lines[1].startswith("wave.status.value = ")
-    assert any("time over after 800 ticks" in line for line in lines)
+    assert any("time over after 500 ticks" in line for line in lines)
     assert rack("rewind", run.parent).returncode == 2
