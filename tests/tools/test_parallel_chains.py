@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "level = 'path', what = 'hold', tick = 101", "level = 'path', what = 'resume', tick = 160"
     )
     config = load(path / "jointed.toml", [f"name=test-{path.name}", held])
-    assert run_rack(config, 1.0, path / "run", Display()).recording == "complete"
+    assert run_rack(config, 0.6, path / "run", Display()).recording == "complete"
     return path / "run"
 
 

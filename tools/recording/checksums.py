@@ -69,6 +69,8 @@ class Checksums:
         """Raise `Failure` for the first of these files that differs from its stored checksum."""
         for name in names:
             path = self._folder / name
+            if name in self.stored and not path.exists():
+                raise Failure(f"{path}: missing, but {CHECKSUMS} lists it", 2)
             if _compute_digest(path) != self.stored.get(name):
                 why = f"damaged, or changed later: its checksum differs from {CHECKSUMS}"
                 raise Failure(f"{path}: {why}", 2)

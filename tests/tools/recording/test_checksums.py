@@ -27,13 +27,14 @@ from rack.tools.recording.parquet import HEAD_COLUMNS
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
+from tests.conftest import EXHAUSTIVE
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
 BOUND_S = 100
 """Bound of a command on a damaged run."""
 SIGNALS = "signals/*/*"
-FLIPS = 15
+FLIPS = 15 if EXHAUSTIVE else 6
 
 
 @pytest.fixture(scope="module")

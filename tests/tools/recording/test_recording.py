@@ -85,7 +85,7 @@ def test_a_missing_file_is_named(damaged: Path, name: str) -> None:
 def test_a_missing_part_is_reported_by_its_number(damaged: Path) -> None:
     part = damaged / PARQUET[1]
     part.rename(part.with_name("0002.parquet"))
-    assert_refused(damaged, "0001.parquet: No such file")
+    assert_refused(damaged, "0001.parquet: missing, but checksums.xxh128 lists it")
 
 
 def messages(recording: Recording) -> dict[str, list[bytes]]:

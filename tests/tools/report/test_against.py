@@ -271,7 +271,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
     against = (one.folder, "--against")
     for arguments, said in (
-        ((*against, runs.commanded.folder), "are of different racks: only the first has "),
+        ((*against, runs.commanded.folder), "are of different racks: only the first has 'wave'"),
         ((*against, tmp_path), "not a run"),
         ((*against, _losing(two)), "lost 3 rows; the two runs cannot be compared"),
         ((*against, two.folder, "--of", "wave.statu"), "nearest: wave.status"),
