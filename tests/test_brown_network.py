@@ -305,7 +305,7 @@ def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
     rack_name: str, tmp_path: Path
 ) -> None:
     general = configs(rack_name, tmp_path)[1]
-    command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json", "--share"]
+    command = [*RACK, "run", general, "--lockstep", "--seconds", "1.2", "--json", "--share"]
     done = run_command(command, MOST_S, cwd=tmp_path, text=True)
     assert done.returncode == 0, done.stderr
     upper = json.loads(done.stdout)

@@ -18,6 +18,7 @@ from rack.boards.crate.clean import remove_dead_rack
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.programs import launcher
 from tests.boards.runs import end_of
+from tests.conftest import EXHAUSTIVE
 from tests.processes import children_of, named, parent_of, runs, wait_until
 
 REALTIME = "clock.mode=realtime"
@@ -206,7 +207,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
     waves: tuple[Path, str], rack_name: str
 ) -> None:
     rng = random.Random(11)
-    for round_ in range(5):
+    for round_ in range(40 if EXHAUSTIVE else 3):
         with launcher(*waves, REALTIME) as program:
             # From the first import to the first cycles; half of the times a segment exists.
             if round_ % 2:
@@ -223,7 +224,7 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
 @pytest.mark.slow
 def test_a_board_killed_at_any_moment_does_not_count_as_hanging(config: MakeConfig) -> None:
     rng = random.Random(5)
-    for _ in range(4):
+    for _ in range(40 if EXHAUSTIVE else 2):
         with Rack(config(REALTIME, NEVER)) as rack:
             rack.start()
             time.sleep(rng.uniform(0.0, 0.06))

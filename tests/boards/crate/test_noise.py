@@ -22,10 +22,11 @@ from rack.backplane.address_map import (
     MAILBOX_HEAD_SIZE,
     compute_operator_entry_size,
 )
-from rack.backplane.errors import BackplaneError
+from rack.backplane.errors import BackplaneError, SegmentError
 from rack.backplane.mailbox.history import compute_digest
 from rack.backplane.segment import Segment, list_racks, unlink_segment
 from rack.backplane.trace import open_trace_ring
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import load, read_stored
 from rack.boards.crate.alarm_events import AlarmReader
@@ -41,6 +42,7 @@ from rack.tools.recording.spool import open_rings
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, named, wait_until
 from tests.tools.command_line import BOUND_S
+from tests.warm import Popen
 
 SEEDS = 6
 ALARM_NUMBERS = 8 * 6
@@ -181,21 +183,29 @@ def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy:
     assert refused or region not in REFUSED
 
 
+def has_ticked(name: str) -> bool:
+    """Return whether a rack is there and past its first ticks."""
+    try:
+        segment = Segment.attach(name)
+    except SegmentError:
+        return False
+    tick = segment.words[System.TICK]
+    segment.close()
+    return tick > 20
+
+
 @contextmanager
 def launched(path: Path, name: str) -> Iterator[subprocess.Popen[str]]:
     """A rack in lockstep without an end, past its first ticks."""
     path.write_text(COMMANDED)
-    process = subprocess.Popen(
+    process = Popen(
         [*RACK, "run", str(path), "--no-record", "--set", f"name={name}"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
     try:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith(name) and "tick 0 " not in line:
-                break
+        wait_until(lambda: has_ticked(name))
         yield process
     finally:
         process.kill()
@@ -208,6 +218,7 @@ def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothin
 ) -> None:
     with launched(tmp_path / "rack.toml", rack_name) as process:
         segment = Segment.attach(rack_name)
+        assert process.poll() is None
         address = segment.map.alarms["lower"]
         count = segment.words[address // 8] + 1
         record = address + CACHE_LINE + count % ALARM_DEPTH * ALARM_RECORD_SIZE

@@ -71,10 +71,15 @@ class Heard(NamedTuple):
     written: Written
 
 
-def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
+def run(
+    config: MakeConfig,
+    *settings: str,
+    faults: tuple[FaultConfig, ...] = (),
+    seconds: float = SECONDS,
+) -> Heard:
     found = config(*settings, text=RACK).model_copy(update={"fault": faults})
     with Rack(found) as rack:
-        outcome = rack.run(SECONDS)
+        outcome = rack.run(seconds)
         written, block = Written.on(rack.segment), rack.segment.get_block("hub")
         heard = written.messages["hub.status"]["message"]
         counts = (
@@ -245,11 +250,11 @@ def test_in_real_time_interrupts_take_the_time_of_the_computation(config: MakeCo
         count = len(in_time(found))
         return "" if count > 20 else f"only {count} cycles of all boards were in time"
 
-    found = run_undisturbed(lambda: run(config, *settings), find_disturbance)
+    found = run_undisturbed(lambda: run(config, *settings, seconds=0.15), find_disturbance)
     cycles = in_time(found)
     computing_ns = cycles["process_ns"] - cycles["read_ns"]
     assert np.median(computing_ns) >= 4e6 + BOARDS * found.service_ns
-    brief = run(config, "clock.mode=realtime", slow, LONG, *FIRST)
+    brief = run(config, "clock.mode=realtime", slow, LONG, *FIRST, seconds=0.1)
     cycles = brief.written.cycles["hub"]
     # A cycle that began in time was over when the messages came.
     assert (cycles["process_ns"] - cycles["read_ns"]).min() < brief.service_ns

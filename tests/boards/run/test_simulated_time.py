@@ -9,6 +9,7 @@ import pytest
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.backplane.words import Block
 from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
@@ -16,19 +17,47 @@ from tests.boards.runs import faulty
 
 SECONDS = 0.25
 FIRST = 40
+LONG_S, LAST = 0.5, 200
+LONG, BELOW, EXACT, CARRIED, STARVED, WATCH, PLAN = 40, 56, 64, 72, 96, 128, 160
+"""Ticks of the faults of one run, each of which is over before the next: multiples of the watch's
+eight."""
+WAVE: dict[str, Any] = {"kind": "overrun", "board": "wave", "cycles": 1}
+FAULTS: tuple[dict[str, Any], ...] = (
+    {**WAVE, "tick": LONG, "by": 2.5},
+    {**WAVE, "tick": BELOW, "by": 0.9},
+    {**WAVE, "tick": EXACT, "by": 1.0},
+    {**WAVE, "tick": CARRIED, "cycles": 6, "by": 1.5},
+    {**WAVE, "tick": STARVED, "by": 20.0},
+    {**WAVE, "board": "watch", "tick": WATCH, "by": 1.5},
+    {
+        "kind": "planner-slow",
+        "board": "wave.planner",
+        "tick": PLAN,
+        "cycles": 1,
+        "by": 0.5,
+    },
+)
+
+
+def end_of(first: int) -> int:
+    """Return the tick of the fault after that at a tick."""
+    return min((fault["tick"] for fault in FAULTS if fault["tick"] > first), default=LAST)
 
 
 class Ran(NamedTuple):
-    """A run with one fault."""
+    """A run with faults."""
 
     digest: str
     written: Written
     events: tuple[Event, ...]
     blocks: dict[str, list[int]]
 
-    def ticks(self, code: str, board: str) -> list[int]:
+    def ticks(self, code: str, board: str, first: int = 0, end: int = LAST) -> list[int]:
         """Return the ticks of the events of a kind about a board."""
-        return [event.tick for event in self.events if (event.code, event.subject) == (code, board)]
+        found = [
+            event.tick for event in self.events if (event.code, event.subject) == (code, board)
+        ]
+        return [tick for tick in found if first <= tick < end]
 
     def cycle(self, task: str, tick: int) -> tuple[Flag, int]:
         """Return the flags of a cycle, and the number of releases skipped before it."""
@@ -36,6 +65,14 @@ class Ran(NamedTuple):
         flags = int(rows["flags"][rows["tick"] == tick][0])
         low = (1 << SKIPPED_SHIFT) - 1
         return Flag(flags & low) & (Flag.MISSED | Flag.SKIPPED), flags >> SKIPPED_SHIFT
+
+    def lost(self, task: str, first: int) -> tuple[int, int]:
+        """Return how many deadlines a task missed and how many releases it skipped because of the
+        fault at a tick."""
+        ticks = self.written.cycles[task]["tick"]
+        cycles = [self.cycle(task, int(tick)) for tick in ticks if first <= tick < end_of(first)]
+        missed = sum(Flag.MISSED in flags for flags, _ in cycles)
+        return missed, sum(skipped for _, skipped in cycles)
 
     def visible(self, mailbox: str, tick: int) -> int:
         """Return the tick at which the message of a cycle is visible."""
@@ -45,8 +82,13 @@ class Ran(NamedTuple):
 
 def run(config: MakeConfig, *settings: str, **fault: Any) -> Ran:
     """Run the rack of the waves with one fault from tick `FIRST` on."""
-    with Rack(faulty(config(*settings), {"tick": FIRST, **fault})) as rack:
-        digest = rack.run(SECONDS).digest
+    return run_faults(config(*settings), {"tick": FIRST, **fault}, seconds=SECONDS)
+
+
+def run_faults(config: RackConfig, *faults: dict[str, Any], seconds: float = LONG_S) -> Ran:
+    """Run a rack with faults."""
+    with Rack(faulty(config, *faults)) as rack:
+        digest = rack.run(seconds).digest
         words = (Block.MISSED, Block.SKIPPED, Block.PLANS)
         blocks = {
             task.name: [rack.segment.get_block(task.name)[word] for word in words]
@@ -55,67 +97,77 @@ def run(config: MakeConfig, *settings: str, **fault: Any) -> Ran:
         return Ran(digest, Written.on(rack.segment), tuple(rack.events), blocks)
 
 
-def test_an_overrun_shows_its_messages_late_and_skips_releases(config: MakeConfig) -> None:
-    found = run(config, kind="overrun", board="wave", cycles=1, by=2.5)
+RUNS: list[Ran] = []
+
+
+@pytest.fixture
+def overrun(config: MakeConfig) -> Ran:
+    """The run with all of `FAULTS`; all tests of this file share it."""
+    if not RUNS:
+        RUNS.append(run_faults(config(), *FAULTS))
+    return RUNS[0]
+
+
+def test_an_overrun_shows_its_messages_late_and_skips_releases(overrun: Ran) -> None:
     # It computes until the middle of tick 42, and then begins late with the release at 42.
-    assert found.visible("wave.status", FIRST) == FIRST + 3
-    assert FIRST + 1 not in found.written.cycles["wave"]["tick"]
-    assert found.cycle("wave", FIRST) == (Flag.MISSED, 0)
-    assert found.cycle("wave", FIRST + 2) == (Flag.SKIPPED, 1)
-    assert found.blocks["wave"][:2] == [1, 1]
-    assert found.ticks("late", "wave") == [FIRST + 1]
-    assert found.ticks("starved", "wave") == []
-    assert run(config, kind="overrun", board="wave", cycles=1, by=2.5).digest == found.digest
+    assert overrun.visible("wave.status", LONG) == LONG + 3
+    assert LONG + 1 not in overrun.written.cycles["wave"]["tick"]
+    assert overrun.cycle("wave", LONG) == (Flag.MISSED, 0)
+    assert overrun.cycle("wave", LONG + 2) == (Flag.SKIPPED, 1)
+    assert overrun.lost("wave", LONG) == (1, 1)
+    assert overrun.ticks("late", "wave", LONG, end_of(LONG)) == [LONG + 1]
+    assert overrun.ticks("starved", "wave", LONG, end_of(LONG)) == []
+    both = [overrun.lost("wave", fault["tick"]) for fault in FAULTS]
+    assert overrun.blocks["wave"][:2] == [sum(counts) for counts in zip(*both, strict=True)]
+
+
+def test_runs_with_overruns_repeat(config: MakeConfig, overrun: Ran) -> None:
+    assert run_faults(config(), *FAULTS).digest == overrun.digest
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("by", "missed", "late"), [(0.9, 0, []), (1.0, 1, [FIRST + 1])])
+@pytest.mark.parametrize(("first", "missed", "late"), [(BELOW, 0, []), (EXACT, 1, [EXACT + 1])])
 def test_computing_must_end_before_the_deadline(
-    config: MakeConfig, by: float, missed: int, late: list[int]
+    overrun: Ran, first: int, missed: int, late: list[int]
 ) -> None:
-    found = run(config, kind="overrun", board="wave", cycles=1, by=by)
-    assert found.blocks["wave"][0] == missed
-    assert found.ticks("late", "wave") == late
-    assert found.visible("wave.status", FIRST) == FIRST + 1 + missed
+    assert overrun.lost("wave", first)[0] == missed
+    assert overrun.ticks("late", "wave", first, end_of(first)) == late
+    assert overrun.visible("wave.status", first) == first + 1 + missed
 
 
 @pytest.mark.slow
-def test_lateness_is_carried_from_cycle_to_cycle(config: MakeConfig) -> None:
-    found = run(config, kind="overrun", board="wave", cycles=6, by=1.5)
-    # Cycles of 1.5 ticks that follow each other: 40.0, 41.5, 43.0, 44.5, and the rest in time.
-    ticks = found.written.cycles["wave"]["tick"]
-    assert ticks[ticks >= FIRST][:6].tolist() == [40, 41, 43, 44, 46, 47]
-    assert found.blocks["wave"][:2] == [4, 2]
+def test_lateness_is_carried_from_cycle_to_cycle(overrun: Ran) -> None:
+    # Cycles of 1.5 ticks that follow each other: 0.0, 1.5, 3.0, 4.5, and the rest in time.
+    ticks = overrun.written.cycles["wave"]["tick"] - CARRIED
+    assert ticks[ticks >= 0][:6].tolist() == [0, 1, 3, 4, 6, 7]
+    assert overrun.lost("wave", CARRIED) == (4, 2)
 
 
 @pytest.mark.slow
-def test_a_task_that_misses_four_releases_is_starved_and_not_restarted(config: MakeConfig) -> None:
-    found = run(config, kind="overrun", board="wave", cycles=1, by=20.0)
-    assert found.ticks("late", "wave") == [FIRST + 1]
-    assert found.ticks("starved", "wave") == [FIRST + 4]
-    assert found.cycle("wave", FIRST + 20) == (Flag.SKIPPED, 19)
-    assert not [event for event in found.events if event.kind in ("loss", "restart")]
+def test_a_task_that_misses_four_releases_is_starved_and_not_restarted(overrun: Ran) -> None:
+    assert overrun.ticks("late", "wave", STARVED, end_of(STARVED)) == [STARVED + 1]
+    assert overrun.ticks("starved", "wave", STARVED, end_of(STARVED)) == [STARVED + 4]
+    assert overrun.cycle("wave", STARVED + 20) == (Flag.SKIPPED, 19)
+    assert not [event for event in overrun.events if event.kind in ("loss", "restart")]
 
 
 @pytest.mark.slow
-def test_a_cycle_of_several_ticks_ends_in_the_middle_of_a_later_one(config: MakeConfig) -> None:
-    found = run(config, kind="overrun", board="watch", cycles=1, by=1.5)
-    # Its period is 8 ticks: it computes from 40 to 52.
-    assert found.visible("watch.status", FIRST) == FIRST + 16
-    assert found.cycle("watch", FIRST) == (Flag.MISSED, 0)
-    assert found.ticks("late", "watch") == [FIRST + 8]
-    assert found.blocks["watch"][:2] == [1, 0]
+def test_a_cycle_of_several_ticks_ends_in_the_middle_of_a_later_one(overrun: Ran) -> None:
+    # Its period is 8 ticks: it computes for 12.
+    assert overrun.visible("watch.status", WATCH) == WATCH + 16
+    assert overrun.cycle("watch", WATCH) == (Flag.MISSED, 0)
+    assert overrun.ticks("late", "watch") == [WATCH + 8]
+    assert overrun.blocks["watch"][:2] == [1, 0]
 
 
 @pytest.mark.slow
-def test_a_slow_plan_is_late(config: MakeConfig) -> None:
-    found = run(config, kind="planner-slow", board="wave.planner", cycles=1, by=0.5)
+def test_a_slow_plan_is_late(overrun: Ran) -> None:
     # A plan has four ticks, and this one takes half a tick more.
-    assert found.cycle("wave.planner", FIRST) == (Flag.MISSED, 0)
-    assert found.visible("wave.plan", FIRST) == FIRST + 5
-    assert found.ticks("plan_late", "wave.planner") == [FIRST + 4]
-    assert found.blocks["wave.planner"][0] == 1
-    assert found.blocks["wave"][:2] == [0, 0]
+    assert overrun.cycle("wave.planner", PLAN) == (Flag.MISSED, 0)
+    assert overrun.visible("wave.plan", PLAN) == PLAN + 5
+    assert overrun.ticks("plan_late", "wave.planner", PLAN, end_of(PLAN)) == [PLAN + 4]
+    assert overrun.lost("wave.planner", PLAN)[0] == 1
+    assert overrun.lost("wave", PLAN) == (0, 0)
 
 
 @pytest.mark.slow
