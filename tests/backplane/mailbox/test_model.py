@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import product
 from typing import Any
 
 import pytest
@@ -18,6 +20,7 @@ from tests.backplane.mailbox.model import (
     Setup,
     explore,
 )
+from tests.conftest import EXHAUSTIVE
 
 COARSE = ("e", "s", "pc")
 """Words of a slot, where two readers copy them: content and checksum together."""
@@ -38,6 +41,10 @@ TAKE_OVERS: dict[str, dict[str, Any]] = {
     "two take-overs and a kill": {"kills": 1, "stops": 2},
 }
 """What may happen while stopped writers are replaced, and each still stores a message."""
+MESSAGES = {Memory.SC: 3, Memory.TSO: 1, Memory.WEAK: 2}
+LARGE = ("two readers", "two take-overs", "two take-overs and a kill")
+"""Cases that have too many states under x86-TSO to be tried each time. Under weak memory, which
+permits more orders of the same stores, they are; and their parts are under x86-TSO."""
 STOPPED: dict[str, Any] = {"kills": 0, "stops": 1, "words": COARSE, "claim": TAKE_OVER}
 NOT_PUBLISHED = "a reader returns a message that was not published"
 NOT_BAD = "a reader takes a published message for a bad one"
@@ -117,9 +124,14 @@ def found(**settings: Any) -> Exploration:
     return explore(Setup(**settings))
 
 
+def tried(cases: Iterable[str]) -> list[tuple[Memory, str]]:
+    """Return the memories and cases to try."""
+    pairs = product(Memory, cases)
+    return [pair for pair in pairs if EXHAUSTIVE or pair not in product([Memory.TSO], LARGE)]
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("memory", Memory)
+@pytest.mark.parametrize(("memory", "case"), tried(CASES))
 def test_the_protocol_holds_in_every_state(memory: Memory, case: str) -> None:
     exploration = found(memory=memory, **CASES[case])
     assert (exploration.violation, exploration.steps) == ("", ())
@@ -127,16 +139,11 @@ def test_the_protocol_holds_in_every_state(memory: Memory, case: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("case", TAKE_OVERS)
-@pytest.mark.parametrize(
-    ("memory", "messages"), [(Memory.SC, 3), (Memory.TSO, 1), (Memory.WEAK, 2)]
-)
-def test_the_protocol_holds_in_every_state_of_a_take_over(
-    memory: Memory, messages: int, case: str
-) -> None:
+@pytest.mark.parametrize(("memory", "case"), tried(TAKE_OVERS))
+def test_the_protocol_holds_in_every_state_of_a_take_over(memory: Memory, case: str) -> None:
     settings = {"stops": 1, **TAKE_OVERS[case]}
     # Two stopped writers have many more states.
-    messages = messages if settings["stops"] == 1 else 1
+    messages = MESSAGES[memory] if settings["stops"] == 1 else 1
     settings |= {"messages": messages, "words": COARSE, "claim": TAKE_OVER}
     exploration = found(memory=memory, **settings)
     assert (exploration.violation, exploration.steps) == ("", ())

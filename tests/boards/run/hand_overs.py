@@ -79,6 +79,8 @@ def cripple_checksum() -> None:
 
 
 COUNTS = np.dtype([(name, "i8") for name in ("read", "torn", "stale", "missing")])
+LOOK = 20
+"""Rounds with a crippled safeguard after which the counts are looked at."""
 ENDS = (
     (signal.SIGKILL, True),
     (signal.SIGKILL, False),
@@ -86,11 +88,12 @@ ENDS = (
     (signal.SIGSTOP, False),
 )
 """How a process ends a round, and whether the one stopped before continues at once."""
-CRIPPLES: dict[str, Callable[[], None]] = {
-    "lock": cripple_lock,
-    "claim": cripple_claim,
-    "checksum": cripple_checksum,
+CRIPPLES: dict[str, tuple[Callable[[], None], str]] = {
+    "lock": (cripple_lock, "double"),
+    "claim": (cripple_claim, "stale"),
+    "checksum": (cripple_checksum, "torn"),
 }
+"""What cripples a safeguard, and what must not happen, and then does."""
 
 
 def build_segment(rack: str) -> Segment:
@@ -248,13 +251,15 @@ class HandOvers:
             writer.close()
         return NEVER - bomb.left
 
-    def run(self) -> None:
-        """Run all rounds, while a process reads."""
+    def run(self, wrong: str = "") -> None:
+        """Run all rounds, or some until what must not happen has happened, while a process reads."""
         with forked(lambda: read_on(self._segment, self.rounds, self.counts[0])):
             before = 0
             for number in range(1, len(self.rounds)):
                 signal.alarm(LIMIT_S)
                 before = self._run_round(number, before)
+                if wrong and number % LOOK == 0 and self.to_document()[wrong]:
+                    break
             signal.alarm(0)
             self._end_stopped(before)
 
@@ -356,12 +361,14 @@ class HandOvers:
 
 
 def main(rack: str, count: int, cripple: str = "") -> None:
+    wrong = ""
     if cripple:
-        CRIPPLES[cripple]()
+        break_safeguard, wrong = CRIPPLES[cripple]
+        break_safeguard()
     segment = build_segment(rack)
     try:
         hand_overs = HandOvers(segment, count)
-        hand_overs.run()
+        hand_overs.run(wrong)
         sys.stdout.write(json.dumps(hand_overs.to_document()))
     finally:
         unlink_segment(rack)

@@ -26,6 +26,7 @@ from rack.boards.run.ports import OutputPorts
 from tests.backplane.bus import NAME, SIZES, Point, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.bare_level import BareLevel
+from tests.conftest import EXHAUSTIVE
 from tests.link import Link, ReadingTask, WritingTask, accesses
 
 ANSWER = "reader.answer"
@@ -33,6 +34,8 @@ DEPTH = 8
 STRANGER = 4321
 """A process that has not claimed the mailbox."""
 NUMBERS = count()
+AT_LENGTH = 1000 if EXHAUSTIVE else 150
+"""Examples with more operations."""
 FAULTS: dict[str, tuple[float, ...]] = {
     "mute": (),
     "drop": (0.6,),
@@ -234,7 +237,7 @@ def test_machine_code_leaves_every_byte_and_verdict_as_python_does(
 
 @pytest.mark.thorough
 @pytest.mark.timeout(600)
-@settings(max_examples=1000)
+@settings(max_examples=AT_LENGTH)
 @given(PROTOCOLS, RATES, st.lists(OPERATIONS, min_size=40, max_size=120))
 def test_machine_code_leaves_every_byte_and_verdict_as_python_does_at_length(
     protocol: Protocol, rates: tuple[int, int], operations: list[Operation]
