@@ -74,6 +74,8 @@ RUNS = (
 HOSTED = ("chimera", "condor", "ibm", "penn")
 """Racks with programs on the host side, whose state cannot be copied: these are repeated with the
 messages that the programs sent."""
+CONTINUED = tuple({run.split()[0]: run for run in RUNS if not run.startswith(HOSTED)}.values())
+"""The last run of each other rack: snapshots of it are continued to the same digest, too."""
 LIBRARIES = ("daqp", "mujoco", "numpy", "ompl", "ruckig")
 PROBE = """
 import hashlib, math

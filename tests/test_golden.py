@@ -30,7 +30,7 @@ def here() -> dict[str, str]:
         pytest.param(run, marks=() if run in golden.OFTEN else pytest.mark.thorough)
         for run in golden.RUNS
         # Snapshots of the others are continued to the same digests in test_random_ticks.py.
-        if run in golden.OFTEN or run.startswith(golden.HOSTED)
+        if run in golden.OFTEN or run not in golden.CONTINUED
     ],
 )
 def test_a_shipped_rack_has_its_golden_digest(
