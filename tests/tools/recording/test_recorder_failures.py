@@ -55,7 +55,7 @@ def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL)
-    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
+    result = run_rack(config, LONG_S / 2, tmp_path / "run", display, step=True)
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
@@ -65,7 +65,7 @@ def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     serials = recording.read_signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
     assert not any(recording.lost_rows.values())
-    whole = run_rack(config, LONG_S, tmp_path / "whole", Display())
+    whole = run_rack(config, LONG_S / 2, tmp_path / "whole", Display())
     assert result.outcome.digest == whole.outcome.digest
     assert counts(recording) == counts(Recording(tmp_path / "whole"))
     # The viewer's file is not overwritten.
@@ -82,7 +82,7 @@ def test_a_stopped_recorder_is_replaced_without_losing_rows(
         # The rings hold two seconds, which is the whole run. It is slow, so that the display comes
         # to look before its end.
         display, config = AtTick(signal.SIGSTOP), realtime(config, speed=0.25)
-    seconds = LONG_S if mode == "lockstep" else 2.0
+    seconds = LONG_S / 2 if mode == "lockstep" else 2.0
     result = run_rack(config, seconds, tmp_path / "run", display, step=mode == "lockstep")
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
