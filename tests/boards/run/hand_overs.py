@@ -252,7 +252,7 @@ class HandOvers:
         return NEVER - bomb.left
 
     def run(self, wrong: str = "") -> None:
-        """Run all rounds, or some until what must not happen has happened, while a process reads."""
+        """Run all rounds, or until something `wrong` has happened, while a process reads."""
         with forked(lambda: read_on(self._segment, self.rounds, self.counts[0])):
             before = 0
             for number in range(1, len(self.rounds)):
