@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from shutil import copytree
+from shutil import copytree, rmtree
+from subprocess import CompletedProcess
+from typing import Any
 
 import pytest
 
 from rack.tools.console.answer import Failure
+from rack.tools.launch.continued import parse_tick
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.file_names import ORIGIN
 from rack.tools.recording.recording import Recording
@@ -18,82 +23,133 @@ from rack.tools.report.report import write_report
 from tests.conftest import SMALL
 from tests.tools.command_line import rack
 
-SECONDS = 2.0
+SECONDS = 0.8
+FAULTS = """
+[[fault]]
+kind = "mute"
+board = "upper"
+tick = 24
+for = "100ms"
+
+[[fault]]
+kind = "kill"
+board = "lower"
+tick = 160
+"""
+BETWEEN_S, LOST_S, BACK_S = 0.2, 0.42, 0.6
+"""Times between the faults, in the outage by the second one, and after it."""
+LEVELS = (Path(__file__).parents[2] / "two_levels.py").read_text()
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 2 s."""
-    folder = tmp_path_factory.mktemp("recorded")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the runs and of the code of their levels."""
+    return tmp_path_factory.mktemp("continued")
+
+
+@pytest.fixture(scope="module")
+def recorded(folder: Path) -> Path:
+    """A run with two faults."""
+    (folder / "changing_levels.py").write_text(LEVELS)
+    (folder / "faults.toml").write_text(FAULTS)
+    text = SMALL.replace("two_levels:", "changing_levels:")
     small = folder / "small.toml"
-    small.write_text(SMALL)
+    small.write_text(text.replace("python_path = [", f'python_path = ["{folder}", '))
     done = rack(
-        *("run", small, "--lockstep", "--seconds", SECONDS),
+        *("run", small, "--lockstep", "--seconds", SECONDS, "--faults", folder / "faults.toml"),
         *("--set", f"name=test-continued-{os.getpid()}", "--out", folder / "one", "--json"),
+        *("--set", "supervision.lockstep_restart_s=0.05"),
     )
     assert done.returncode == 0, done.stderr
     return folder / "one"
 
 
+def continued(run: Path, at_s: float, *options: object) -> CompletedProcess[str]:
+    return rack("run", "--from", f"{run}@{at_s}", "--seconds", SECONDS, "--json", *options)
+
+
+@pytest.fixture(scope="module")
+def branch(recorded: Path, folder: Path) -> Path:
+    """A run that continues that one, between its faults."""
+    before = content(recorded)
+    done = continued(recorded, BETWEEN_S, "--out", folder / "two")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert content(recorded) == before
+    assert json.loads(done.stdout)["recording"] == "complete"
+    return folder / "two"
+
+
+@pytest.fixture(scope="module")
+def second(branch: Path, folder: Path) -> Path:
+    """A run that continues the continued one, after the outage."""
+    done = continued(branch, BACK_S, "--out", folder / "three")
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "three"
+
+
 @pytest.fixture
 def run(recorded: Path, tmp_path: Path) -> Path:
-    """A copy of that run, which a test may change."""
+    """A copy of the first run, which a test may change."""
     return Path(copytree(recorded, tmp_path / "one"))
+
+
+@contextmanager
+def moved(run: Path, to: Path) -> Iterator[Path]:
+    """Have a run at another place."""
+    yield run.rename(to)
+    if run.exists():
+        rmtree(run)
+    to.rename(run)
 
 
 def content(run: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
+def read_report(run: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((run / "report.json").read_text())
+    return report
+
+
 @pytest.mark.slow
-def test_a_continued_run_is_recorded_with_its_origin(run: Path, tmp_path: Path) -> None:
-    before = content(run)
-    two = tmp_path / "two"
-    done = rack(
-        *("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", two, "--json"),
-    )
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["digest"] == json.loads((run / "report.json").read_text())["digest"]
-    assert report["recording"] == "complete"
+def test_a_continued_run_is_recorded_with_its_origin(recorded: Path, branch: Path) -> None:
+    report = read_report(branch)
+    assert report["digest"] == read_report(recorded)["digest"]
     # Nothing that could be run.
     kinds = {".toml", ".jsonl", ".json", ".md", ".parquet", ".rrd", ".xxh128"}
-    assert {path.suffix for path in two.rglob("*") if path.is_file()} <= kinds
-    one, other = Recording(run), Recording(two)
+    assert {path.suffix for path in branch.rglob("*") if path.is_file()} <= kinds
+    one, other = Recording(recorded), Recording(branch)
     for name in other.mailboxes:
         serials = other.read_signal(name, "serial")
-        assert other.read_signal(name, "tick")[0] >= 480
+        assert other.read_signal(name, "tick")[0] >= 80
         assert serials.tolist() == one.read_signal(name, "serial")[-len(serials) :].tolist()
-    assert other.read_trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
+    assert other.read_trace("lower")["tick"][[0, -1]].tolist() == [80, 319]
     assert report["continues"] == {
-        "folder": str(run),
-        "tick": 480,
-        "time_s": 1.2,
+        "folder": str(recorded),
+        "tick": 80,
+        "time_s": BETWEEN_S,
         "launched_ns": one.launch.created_ns,
     }
-    assert f"continues {run} from 1.2 s" in " ".join(rack("report", two).stdout.split())
-    assert content(run) == before
-    assert json.loads(rack("report", run, "--json").stdout)["continues"] is None
+    said = " ".join(rack("report", branch).stdout.split())
+    assert f"continues {recorded} from {BETWEEN_S} s" in said
+    assert json.loads(rack("report", recorded, "--json").stdout)["continues"] is None
 
 
 @pytest.mark.slow
 def test_the_origin_of_a_branch_is_found_only_if_it_is_unchanged(
-    run: Path, small: Path, rack_name: str, tmp_path: Path
+    recorded: Path, branch: Path, tmp_path: Path
 ) -> None:
-    rack("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", tmp_path / "two", "--json")
-    moved = tmp_path / "moved"
-    moved.mkdir()
-    for folder in (run, tmp_path / "two"):
-        folder.rename(moved / folder.name)
-    against = ("report", moved / "two", "--against", "origin")
-    found = json.loads(rack(*against, "--json").stdout)["against"]
-    assert (found["folder"], found["first_difference"]) == (str(moved / "one"), None)
-    (moved / "one").rename(moved / "elsewhere")
-    names = ("--set", f"name={rack_name}", "--out", run)
-    rack("run", small, "--lockstep", "--seconds", SECONDS, *names)
-    refused = rack(*against)
-    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert f"continues {run}, but that run no longer exists" in refused.stderr
+    with moved(branch, tmp_path / "two") as two:
+        against = ("report", two, "--against", "origin")
+        with moved(recorded, tmp_path / "one") as one:
+            found = json.loads(rack(*against, "--json").stdout)["against"]
+            assert (found["folder"], found["first_difference"]) == (str(one), None)
+        with moved(recorded, tmp_path / "elsewhere"):
+            # Another run is there.
+            copytree(two, recorded)
+            refused = rack(*against)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+        assert f"continues {recorded}, but that run no longer exists" in refused.stderr
 
 
 @pytest.mark.slow
@@ -105,41 +161,26 @@ def test_an_invalid_origin_is_refused(run: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_in_an_outage_has_no_state_and_the_time_is_refused(
-    small: Path, rack_name: str, tmp_path: Path
+    recorded: Path, second: Path
 ) -> None:
-    script = tmp_path / "kill.toml"
-    script.write_text('[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 440\n')
-    one = tmp_path / "one"
-    common = ("--seconds", SECONDS, "--json")
-    names = ("--set", f"name={rack_name}", "--out", one, "--faults", script)
-    whole = rack("run", small, "--lockstep", *names, *common)
-    refused = rack("run", "--from", f"{one}@1.2", "--no-record", *common)
+    refused = continued(recorded, LOST_S, "--no-record")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert "1.2: a board is lost at this time" in refused.stderr
+    assert f"{LOST_S}: a board is lost at this time" in refused.stderr
     # Back, and restarted, it goes on; the loss counts.
-    later = rack("run", "--from", f"{one}@1.8", "--no-record", *common)
-    assert json.loads(later.stdout)["digest"] == json.loads(whole.stdout)["digest"]
+    assert read_report(second)["digest"] == read_report(recorded)["digest"]
 
 
 @pytest.mark.slow
-def test_a_state_that_differs_from_the_recording_is_noted(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    code = (Path(__file__).parents[2] / "two_levels.py").read_text()
-    levels = tmp_path / "changing_levels.py"
-    levels.write_text(code)
-    text = small.read_text().replace("two_levels:", "changing_levels:")
-    small.write_text(text.replace("python_path = [", f'python_path = ["{tmp_path}", '))
-    one = tmp_path / "one"
-    names = ("--set", f"name={rack_name}", "--out", one)
-    rack("run", small, "--lockstep", "--seconds", SECONDS, *names)
-    again = ("run", "--from", f"{one}@1.2", "--seconds", SECONDS, "--no-record", "--json")
-    assert not rack(*again).stderr
-    levels.write_text(code.replace(".count + 1", ".count + 1 + 1"))
-    refused = rack(*again)
+def test_a_state_that_differs_from_the_recording_is_noted(recorded: Path, folder: Path) -> None:
+    levels = folder / "changing_levels.py"
+    levels.write_text(LEVELS.replace(".count + 1", ".count + 1 + 1"))
+    try:
+        refused = continued(recorded, BETWEEN_S, "--no-record")
+        done = continued(recorded, BETWEEN_S, "--no-record", "--anyway")
+    finally:
+        levels.write_text(LEVELS)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert f"since it was recorded, these have changed: {levels}; --anyway" in refused.stderr
-    done = rack(*again, "--anyway")
     assert f"these have changed: {levels}; digests may differ" in done.stderr
     first = r"first upper\.command at tick 0, goal was 1, is 2"
     why = f"upper.command, .* are not as recorded: {first}: the code of a level has changed since"
@@ -147,26 +188,26 @@ def test_a_state_that_differs_from_the_recording_is_noted(
 
 
 @pytest.mark.slow
-def test_a_run_that_continues_another_is_continued(run: Path, tmp_path: Path) -> None:
-    two = tmp_path / "two"
-    common = ("--seconds", SECONDS, "--json")
-    done = rack("run", "--from", f"{run}@0.5", "--out", two, *common)
-    last = rack("run", "--from", f"{two}@1.5", "--no-record", *common)
-    assert json.loads(last.stdout)["digest"] == json.loads(done.stdout)["digest"]
+def test_a_run_that_continues_another_is_continued(
+    recorded: Path, branch: Path, second: Path, tmp_path: Path
+) -> None:
+    assert read_report(second)["digest"] == read_report(branch)["digest"]
     # Its beginning is the other's.
-    run.rename(tmp_path / "elsewhere")
-    refused = rack("run", "--from", f"{two}@0.6", "--no-record")
+    with moved(recorded, tmp_path / "elsewhere"):
+        refused = continued(branch, LOST_S, "--no-record")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert f"continues {run}, but that run no longer exists" in refused.stderr
+    assert f"continues {recorded}, but that run no longer exists" in refused.stderr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", ["2", "-1", "nan", "inf", "soon"])
-def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: str) -> None:
-    refused = rack("run", "--from", f"{recorded}@{at}", "--out", tmp_path / "two")
+def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path) -> None:
+    refused = continued(recorded, SECONDS, "--out", tmp_path / "two")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert f"{at}: must be 0 to 1.9975 s" in refused.stderr
+    assert f"{SECONDS}: must be 0 to 0.7975 s" in refused.stderr
     assert not (tmp_path / "two").exists()
+    for at in ("-1", "nan", "inf", "soon"):
+        with pytest.raises(Failure, match=f"^{at}: must be 0 to 0.7975 s"):
+            parse_tick(Recording(recorded), at)
 
 
 @pytest.mark.slow
@@ -189,37 +230,28 @@ def test_a_folder_that_is_not_a_run_is_refused(
 
 
 @pytest.mark.slow
-def test_a_run_of_an_older_version_needs_the_option_anyway(run: Path, tmp_path: Path) -> None:
-    again = ("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--no-record", "--json")
+def test_a_run_of_an_older_version_needs_the_option_anyway(run: Path) -> None:
     code = run / "code.json"
     code.write_text(code.read_text().replace('"rack": "', '"rack": "0'))
     Checksums(run).store(code.name)
-    refused = rack(*again)
+    refused = continued(run, BETWEEN_S, "--no-record")
     assert "since it was recorded, these have changed: the code of rack; --any" in refused.stderr
     code.unlink()
-    refused = rack(*again)
+    refused = continued(run, BETWEEN_S, "--no-record")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "it has no code.json, because 'rack record' or an older version" in refused.stderr
-    done = rack(*again, "--anyway")
-    assert (
-        json.loads(done.stdout)["digest"] == json.loads((run / "report.json").read_text())["digest"]
-    )
+    done = continued(run, BETWEEN_S, "--no-record", "--anyway")
+    assert json.loads(done.stdout)["digest"] == read_report(run)["digest"]
 
 
 @pytest.mark.slow
-def test_a_fault_detected_before_a_branch_is_judged_as_in_the_whole_run(tmp_path: Path) -> None:
-    small, script = tmp_path / "small.toml", tmp_path / "mute.toml"
-    small.write_text(SMALL)
-    script.write_text('[[fault]]\nkind = "mute"\nboard = "upper"\nat = 0.4\nfor = "400ms"\n')
-    name = f"name=test-judged-{os.getpid()}"
-    whole, branch, second = (tmp_path / run for run in ("whole", "branch", "second"))
-    rack("run", small, "--lockstep", "--seconds", 1.2, "--faults", script, "--set", name,
-         "--out", whole)  # fmt: skip
-    for origin, out in ((f"{whole}@0.6", branch), (f"{branch}@0.7", second)):
-        rack("run", "--from", origin, "--seconds", 1.2, "--out", out)
-    reports = [json.loads((run / "report.json").read_text()) for run in (whole, branch, second)]
-    (fault,) = reports[0]["faults"]
-    assert (fault["seen"], fault["found_as"], fault["is_within"]) == ("detected", "mute", True)
-    assert fault["struck"] + fault["delay"] < 240
-    assert [report["faults"] for report in reports[1:]] == [[fault], [fault]]
+def test_a_fault_detected_before_a_branch_is_judged_as_in_the_whole_run(
+    recorded: Path, branch: Path, second: Path
+) -> None:
+    reports = [read_report(run) for run in (recorded, branch, second)]
+    mute, kill = reports[0]["faults"]
+    assert (mute["seen"], mute["found_as"], mute["is_within"]) == ("detected", "mute", True)
+    assert mute["struck"] + mute["delay"] < 80
+    assert (kill["seen"], kill["struck"]) == ("detected", 160)
+    assert [report["faults"] for report in reports[1:]] == [[mute, kill]] * 2
     assert not any(report["unexplained"] for report in reports)
