@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator
@@ -103,3 +104,17 @@ def test_an_unknown_transport_is_refused(
         2,
         "RMW_IMPLEMENTATION = rmw_fastrtps_cpp: must be rmw_zenoh_cpp or rmw_cyclonedds_cpp\n",
     )
+
+
+def test_a_rack_with_a_bridge_has_the_same_digest(
+    peer: Peer, rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("nasrem", "--lockstep", "--seconds", "0.5", "--no-record", "--json")
+
+    def run(*bridges: str) -> str:
+        done = rack("run", *words, *bridges, "--set", f"name={rack_name}")
+        return str(json.loads(done.stdout)["outcome"]["digest"])
+
+    for name, value in peer.environment.items():
+        monkeypatch.setenv(name, value)
+    assert run("--ros2") == run()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import sys
 from base64 import b64decode
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,11 +28,19 @@ HEAD = struct.Struct("<BIQ")
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeldRack]:
+    """A rack without the extra for ROS 2."""
     folder = tmp_path_factory.mktemp("shown")
-    words = ("nasrem", "--foxglove", "--out", folder / "run")
-    with held_rack(folder, f"test-fox-{os.getpid()}", words, {"FOXGLOVE_PORT": "0"}) as held:
+    (folder / "zenoh.py").write_text("raise ModuleNotFoundError('gone', name='zenoh')")
+    words = ("nasrem", "--ros2", "--foxglove", "--out", folder / "run")
+    environment = {"FOXGLOVE_PORT": "0", "PYTHONPATH": str(folder)}
+    with held_rack(folder, f"test-fox-{os.getpid()}", words, environment) as held:
         held.wait_for("in Foxglove")
         yield held
+    # A bridge changes nothing.
+    outcome = json.loads((folder / "run" / "report.json").read_text())["outcome"]
+    plain = ("nasrem", "--lockstep", "--no-record", "--json", "--set", f"name={held.name}")
+    done = rack("run", *plain, "--seconds", outcome["ticks"] * held.segment.layout.clock_ns * 1e-9)
+    assert json.loads(done.stdout)["outcome"]["digest"] == outcome["digest"]
 
 
 class Client:
@@ -81,10 +90,13 @@ def find_port(held: HeldRack) -> int:
     return int(held.log.read_text().partition("open ws://127.0.0.1:")[2].split()[0])
 
 
-def connect_to(held: HeldRack, close_s: float = 10.0) -> ClientConnection:
+def connect_to(held: HeldRack, close_s: float = 10.0, most: int | None = None) -> ClientConnection:
+    """Connect a client, which lays up at most so many messages that it has not read."""
     url = f"ws://127.0.0.1:{find_port(held)}"
     protocols: Any = ["foxglove.sdk.v1"]
-    return connect(url, subprotocols=protocols, max_size=None, close_timeout=close_s)
+    return connect(
+        url, subprotocols=protocols, max_size=None, max_queue=most, close_timeout=close_s
+    )
 
 
 def test_a_client_gets_scene_curves_timing_and_log(shown: HeldRack) -> None:
@@ -121,7 +133,7 @@ def test_clients_come_and_go_and_a_second_server_is_refused(shown: HeldRack) -> 
             client.receive()
             shown.step(40)
     # A client that subscribes and never reads delays nobody. It cannot be closed in order.
-    with connect_to(shown, close_s=0.0) as socket:
+    with connect_to(shown, close_s=0.0, most=16) as socket:
         Client(socket).receive()
         shown.step(400)
     assert runs(shown.find_bridge())
@@ -175,13 +187,13 @@ def test_mistakes_are_one_line_each(
         assert why in done.stderr
 
 
-def test_a_missing_extra_is_named_and_the_rack_runs(rack_name: str, tmp_path: Path) -> None:
-    for library in ("zenoh", "foxglove"):
-        text = f"raise ModuleNotFoundError('gone', name={library!r})"
-        (tmp_path / f"{library}.py").write_text(text)
-    words = ("fig2", "--ros2", "--foxglove", "--no-record")
-    hidden = {"PYTHONPATH": str(tmp_path)}
-    with held_rack(tmp_path, rack_name, words, hidden) as held:
-        held.step(5)
-        held.wait_for("ros2: zenoh is missing: pip install 'nasrem-rack[ros2]'")
-        held.wait_for("foxglove: foxglove is missing: pip install 'nasrem-rack[foxglove]'")
+def test_a_missing_extra_is_named_and_the_rack_runs(
+    shown: HeldRack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown.step(5)
+    shown.wait_for("ros2: zenoh is missing: pip install 'nasrem-rack[ros2]'")
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.delitem(sys.modules, "rack.tools.bridges.foxglove", raising=False)
+    done = rack("bridge", shown.name, "foxglove")
+    why = "foxglove is missing: pip install 'nasrem-rack[foxglove]'\n"
+    assert (done.returncode, done.stderr) == (1, why)

@@ -25,6 +25,7 @@ from tests.tools.command_line import BOUND_S, rack
 pytestmark = pytest.mark.slow
 PUMA = ["j1", "j2", "j3", "j4", "j5", "j6"]
 PAGE = ROOT / "tools" / "NEIGHBOURS.md"
+OTHER = "42/joint_trajectory/trajectory_msgs::msg::dds_::JointTrajectory_/RIHS01_00"
 EXTERNAL = ("chimera", "--set", "host.command.external=true", "--ros2")
 
 
@@ -128,7 +129,7 @@ def test_a_killed_bridge_leaves_the_rack_unhurt(arm: HeldRack, peer: Peer) -> No
 
 
 @pytest.mark.timeout(300)
-def test_trajectories_move_an_arm_and_are_replayed(
+def test_trajectories_move_an_arm_and_are_replayed_and_mistakes_are_one_line_each(
     peer: Peer, rack_name: str, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -143,6 +144,9 @@ def test_trajectories_move_an_arm_and_are_replayed(
     points = [(0.5, [0.1, -1.4, 0.05, -2.9, 1.3, 0.1]), last]
     with held_rack(tmp_path, rack_name, (*EXTERNAL, "--out", run), peer.environment) as held:
         wait_until(lambda: peer.ask("is_followed"), BOUND_S)
+        peer.ask("put", hex="00010000ffffffffffffffff", times=2000)
+        held.wait_for("/joint_trajectory: 12 bytes are not a trajectory_msgs/msg/JointTrajectory")
+        assert held.log.read_text().count("12 bytes are not") <= 5
         peer.ask("move", joints=swapped, points=points)
         newest = NewestMessages(held.segment)
         steps = 0
@@ -162,7 +166,10 @@ def test_trajectories_move_an_arm_and_are_replayed(
         ]
         for mistake, why in mistakes:
             insist(held, peer, f"ros2: /joint_trajectory: {why}", "move", **mistake)
+        why = f"of another type or version: {OTHER}; valid: "
+        insist(held, peer, why, "put", key=OTHER, hex="00")
         held.step(200)
+        assert runs(held.find_bridge())
         assert newest.read_message("trajectory.status").done == status.done
     (repeated,) = repeat(run, tmp_path)
     assert repeated == json.loads((run / "report.json").read_text())["outcome"]["digest"]
@@ -184,20 +191,3 @@ def repeat(run: Path, folder: Path) -> list[str]:
     words = ("--lockstep", "--entries", run, "--seconds", ticks * 0.002, "--json", "--no-record")
     done = rack("run", run / "config.toml", *words)
     return [json.loads(done.stdout)["outcome"]["digest"]]
-
-
-def test_floods_and_other_types_are_one_line_each(
-    peer: Peer, rack_name: str, tmp_path: Path
-) -> None:
-    other = "42/joint_trajectory/trajectory_msgs::msg::dds_::JointTrajectory_/RIHS01_00"
-    words = (*EXTERNAL, "--no-record")
-    with held_rack(tmp_path, rack_name, words, peer.environment) as held:
-        wait_until(lambda: peer.ask("is_followed"), BOUND_S)
-        peer.ask("put", hex="00010000ffffffffffffffff", times=2000)
-        held.wait_for("/joint_trajectory: 12 bytes are not a trajectory_msgs/msg/JointTrajectory")
-        assert held.log.read_text().count("12 bytes are not") <= 5
-        insist(
-            held, peer, f"of another type or version: {other}; valid: ", "put", key=other, hex="00"
-        )
-        held.step(100)
-        assert runs(held.find_bridge())
