@@ -39,14 +39,19 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(params=["lockstep", "realtime"])
-def own(request: pytest.FixtureRequest, path: Path, rack_name: str) -> Iterator[Rack]:
-    """A rack that runs in the background."""
-    with Rack.from_file(path, [f"name={rack_name}", f"clock.mode={request.param}"]) as own:
+@pytest.fixture(scope="module", params=["lockstep", "realtime"])
+def own(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Rack]:
+    """A rack that runs in the background, until the last of its tests stops it."""
+    path = tmp_path_factory.mktemp("own") / "commanded.toml"
+    path.write_text(COMMANDED)
+    name = f"{os.getpid()}-{request.param}"
+    with Rack.from_file(path, [f"name={name}", f"clock.mode={request.param}"]) as own:
         own.run_in_background()
         yield own
-    assert rack_name not in list_racks()
-    wait_until(lambda: not named(f"{rack_name}:"))
+    assert name not in list_racks()
+    wait_until(lambda: not named(f"{name}:"))
 
 
 @pytest.fixture
@@ -71,10 +76,6 @@ def test_a_rack_runs_while_its_program_reads_and_commands(own: Rack, live: Attac
     assert live.command("upper", "resume").worked
     live.wait_until(f"lower.status.count > {held}", BOUND_S)
     assert own.wait(0.0) is None
-    own.stop()
-    outcome = own.wait(BOUND_S)
-    assert outcome is not None
-    assert outcome.cause == "stopped"
 
 
 @pytest.mark.slow
@@ -109,6 +110,14 @@ def test_a_parameter_is_set_and_a_pause_holds_the_rack(own: Rack, live: Attached
     wait_until(lambda: words[System.DEMAND] == Demand.BRAKE)
     live.estop(reset=True)
     wait_until(lambda: words[System.DEMAND] != Demand.BRAKE)
+
+
+@pytest.mark.slow
+def test_a_rack_is_stopped(own: Rack) -> None:
+    own.stop()
+    outcome = own.wait(BOUND_S)
+    assert outcome is not None
+    assert outcome.cause == "stopped"
 
 
 @pytest.mark.slow
