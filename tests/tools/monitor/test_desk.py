@@ -218,7 +218,7 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
 ) -> None:
     path = tmp_path / "told.toml"
     path.write_text(COMMANDED)
-    run = ("run", path, "--no-record", "--json", "--seconds", "1", "--set", f"name={rack_name}")
+    run = ("run", path, "--no-record", "--json", "--seconds", "0.4", "--set", f"name={rack_name}")
     held = Popen([*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     wait_until(lambda: rack_name in list_racks() and Segment.attach(rack_name).words[System.HELD])
     given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")

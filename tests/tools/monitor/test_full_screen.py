@@ -92,7 +92,7 @@ def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> No
     on_screen(running, act)
 
 
-def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
+def test_keys_command_the_chosen_level_until_the_run_ends(running: str) -> None:
     async def act(pilot: Pilot[None]) -> None:
         await pilot.press("h")
         await shows(pilot, "held by the operator", f"rack command {running} upper resume")
@@ -102,12 +102,8 @@ def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
         await shows(pilot, "held by the operator", f"rack command {running} lower resume")
         await pilot.press("r")
         await shows(pilot, not_any_more="held by the operator")
-
-    on_screen(running, act, (100, 30))
-
-
-def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:
-    async def act(pilot: Pilot[None]) -> None:
+        # The menu of faults is about the chosen level, the upper one again.
+        await pilot.press("l")
         await pilot.press("i")
         await shows(pilot, "kill")
         await pilot.press("enter")
@@ -118,15 +114,11 @@ def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:
         await pilot.press("3")
         await shows(pilot, "fault: upper: mute begins, for 40000 ticks")
 
-    on_screen(running, act, (100, 30))
-
-
-def test_the_screen_ends_with_the_run(running: str) -> None:
-    async def act(pilot: Pilot[None]) -> None:
+        # The screen ends with the run.
         assert rack("stop", running).returncode == 0
         async with asyncio.timeout(BOUND_S):
             while pilot.app.is_running:
                 await pilot.pause(0.05)
 
-    on_screen(running, act)
+    on_screen(running, act, (100, 30))
     wait_until(lambda: running not in list_racks(), BOUND_S)

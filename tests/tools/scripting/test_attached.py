@@ -40,9 +40,7 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module", params=["lockstep", "realtime"])
-def own(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Rack]:
+def own(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rack]:
     """A rack that runs in the background, until the last of its tests stops it."""
     path = tmp_path_factory.mktemp("own") / "commanded.toml"
     path.write_text(COMMANDED)

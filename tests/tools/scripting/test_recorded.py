@@ -14,13 +14,11 @@ import rack
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.events import Event
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import format_checked_line
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED
-from tests.conftest import SMALL
-from tests.shared_runs import nasrem_run, small_run
+from tests.processes import BOUND_S
+from tests.shared_runs import SMALL_S, nasrem_run, small_run
 
 pytestmark = pytest.mark.slow
 
@@ -64,19 +62,14 @@ def test_a_run_at_a_time_has_the_messages_that_tasks_read_then(small: Path) -> N
         rack.open_run(small).at(4.1)
 
 
-def test_a_run_is_resumed_from_a_time_in_the_background(tmp_path: Path, rack_name: str) -> None:
-    path = tmp_path / "small.toml"
-    path.write_text(SMALL)
-    config = load(path, [f"name={rack_name}"])
-    run = tmp_path / "run"
-    run_rack(config, 2.0, run, Display())
-    expected = Recording(run).end_counts["outcome"]
-    with rack.open_run(run).at(1.2025).resume(seconds=2.0) as resumed:
-        outcome = resumed.wait(20)
+def test_a_run_is_resumed_from_a_time_in_the_background(small: Path) -> None:
+    expected = Recording(small).end_counts["outcome"]
+    with rack.open_run(small).at(1.2025).resume(seconds=SMALL_S) as resumed:
+        outcome = resumed.wait(BOUND_S)
     assert outcome is not None
     assert (outcome.digest, outcome.ticks) == (expected["digest"], expected["ticks"])
     with pytest.raises(rack.Failure, match=r"board\.upper\.more = 1: unknown key"):
-        rack.open_run(run).at(1.2025).resume("board.upper.more=1")
+        rack.open_run(small).at(1.2025).resume("board.upper.more=1")
 
 
 def test_events_and_report_are_those_of_the_run(small: Path) -> None:

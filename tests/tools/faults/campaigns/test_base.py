@@ -131,21 +131,26 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
     bench: Bench,
 ) -> None:
     plan = Plan(1, "faults", True, (MUTE, {**MUTE, "tick": 520}))
-    for _ in range(2):
-        continued, whole = bench.run(plan), bench.run(plan, whole=True)
-        assert verdict(continued) == verdict(whole)
-        assert (continued.is_cut, whole.is_cut) == (True, False)
-        assert continued.outcome is not None
-        assert whole.outcome is not None
-        # The second fault ends at tick 540 and is recovered from, so only late reports may follow:
-        # after a reader's next cycle, and for 0.25 s.
-        assert 540 + 100 < continued.outcome.ticks <= 540 + 100 + 10 < whole.outcome.ticks
-        assert continued.start.tick == 300
-        # With the events of the faultless rack until then.
-        assert min(event.tick for event in continued.events) < 0
-        again = bench.run(plan)
-        assert again.outcome is not None
-        assert again.outcome.ticks == continued.outcome.ticks
+    continued, whole = bench.run(plan), bench.run(plan, whole=True)
+    assert verdict(continued) == verdict(whole)
+    assert (continued.is_cut, whole.is_cut) == (True, False)
+    assert continued.outcome is not None
+    assert whole.outcome is not None
+    # The second fault ends at tick 540 and is recovered from, so only late reports may follow:
+    # after a reader's next cycle, and for 0.25 s.
+    assert 540 + 100 < continued.outcome.ticks <= 540 + 100 + 10 < whole.outcome.ticks
+    assert continued.start.tick == 300
+    # With the events of the faultless rack until then.
+    assert min(event.tick for event in continued.events) < 0
+    # From the same snapshot, also after a whole trial.
+    again = bench.run(plan)
+    assert again.outcome is not None
+    assert again.outcome.ticks == continued.outcome.ticks
+    assert (verdict(again), again.start, again.is_cut) == (
+        verdict(whole),
+        continued.start,
+        True,
+    )
 
 
 @pytest.mark.slow
