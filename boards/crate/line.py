@@ -93,7 +93,13 @@ class CrateLine:
         return self._process.pid
 
     def read_output(self) -> list[str]:
-        """Return the lines that boards have printed since the last call."""
+        """Return the lines that boards have printed since the last call.
+
+        Returns:
+            The lines. Empty once the crate has been ended.
+        """
+        if self._is_closed:
+            return []
         data = os.pread(self._printed, 1 << 20, self._read_to)
         lines = split_lines(data)
         self._read_to += sum(map(len, lines))

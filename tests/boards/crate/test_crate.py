@@ -111,6 +111,8 @@ def test_a_warm_crate_serves_racks_one_after_the_other_and_keeps_nothing_of_them
     warm.end_crate()
     assert warm.is_over
     assert not runs(warm.pid)
+    with pytest.raises(LaunchError, match="the crate has ended"), Rack(config, crate=warm):
+        pass
 
 
 @pytest.mark.slow
