@@ -1,6 +1,6 @@
 """The machine that tests run on: what it permits, and whose turn it is.
 
-Tests run two at a time. One that judges what real-time processes do on their cores needs the
+Tests run three at a time. One that judges what real-time processes do on their cores needs the
 machine to itself: it is marked `alone`, waits until every other test is done, and no other begins
 before it has ended.
 """

@@ -52,9 +52,8 @@ class LockstepDriver(ClockDriver):
     """Driver of the clock in lockstep.
 
     Attributes:
-        snapshot: Function called before every tick or batch, which takes a snapshot if one is
-            due. It returns the next tick before which it must be called. Initially a function
-            that does nothing.
+        snapshot: Function that takes a snapshot before a tick if one is due, and returns the next
+            tick before which it must be called. Initially a function that does nothing.
         permits_batches: False if cycles may take simulated time at any tick.
     """
 
@@ -124,7 +123,8 @@ class LockstepDriver(ClockDriver):
         """
         # Take the snapshot before any work for this tick, because a run that continues from it
         # begins with this tick.
-        self._snapshot_at = self.snapshot(tick)
+        if tick >= self._snapshot_at:
+            self._snapshot_at = self.snapshot(tick)
         return (
             self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
         )

@@ -24,8 +24,10 @@ from rack.boards.run.settings import change_settings
 from rack.boards.run.task import Task
 from rack.levels.level import Executor, Planner
 
-FIRST_COST_S = 0.03
+FIRST_COST_S = 0.05
 """Time for which a snapshot is assumed to stop the rack, before the first one is measured."""
+LOOK_TICKS = 50
+"""Number of ticks after which the clock checks again whether a snapshot is due at this time."""
 COPY_REFUSED = -1
 """Value of `Block.COPY` by which a task reports that it cannot be copied."""
 
@@ -99,8 +101,7 @@ class ClockCopies:
         """Take a snapshot before `tick`, if one is due and no task is lost or stopped.
 
         Returns:
-            The next tick before which a snapshot is due. Snapshots that are due at a time, not at a
-                tick, are disregarded.
+            The next tick before which a snapshot may be due.
         """
         if self._is_refused:
             return sys.maxsize
@@ -117,10 +118,12 @@ class ClockCopies:
             if all(are_there) and self._take_snapshot(tick):
                 # This process is a copy from which a rack continues. Apply that rack's policy.
                 return self(tick)
-        next_requested = requested_tick if requested_tick > tick else sys.maxsize
-        return (
-            min(next_requested, max(self._taken_at + every, tick + 1)) if every else next_requested
-        )
+        next_ticks = [requested_tick] if requested_tick > tick else []
+        if every:
+            next_ticks.append(max(self._taken_at + every, tick + 1))
+        if part:
+            next_ticks.append(tick + LOOK_TICKS)
+        return min(next_ticks, default=sys.maxsize)
 
     def _take_snapshot(self, tick: int) -> bool:
         """Take a snapshot before `tick`. If a task cannot be copied, take no further snapshots.

@@ -254,19 +254,25 @@ def test_a_batch_ends_at_the_end_of_the_run_or_at_a_hold(
     assert driver._find_batch_end(driver.list_due_tasks(1, 0), 1) == end
 
 
-def test_a_batch_ends_before_the_next_work_of_the_clock(make_bus: MakeBus) -> None:
+@pytest.mark.parametrize(("snapshot_at", "end"), [(sys.maxsize, 7), (4, 4), (1, 2)])
+def test_a_batch_ends_before_the_next_work_of_the_clock_or_the_next_snapshot(
+    make_bus: MakeBus, snapshot_at: int, end: int
+) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
     driver.controller = Idle(until=7)
+    called_at = []
+
+    def snapshot(tick: int) -> int:
+        called_at.append(tick)
+        return snapshot_at
+
+    driver.snapshot = snapshot
     driver._wait_for_tick(1)
-    due = driver.list_due_tasks(1, 0)
-    assert driver._find_batch_end(due, 1) == 7
-    driver.snapshot = lambda tick: 4
-    driver._wait_for_tick(1)
-    assert driver._find_batch_end(due, 1) == 4
-    driver.snapshot = lambda tick: tick
-    driver._wait_for_tick(1)
-    assert driver._find_batch_end(due, 1) == 2
+    assert driver._find_batch_end(driver.list_due_tasks(1, 0), 1) == end
+    for tick in range(2, 6):
+        driver._wait_for_tick(tick)
+    assert called_at == [1, *(tick for tick in range(2, 6) if tick >= snapshot_at)]
 
 
 def test_a_planner_several_tasks_and_one_that_is_stopped_get_one_tick_each(
