@@ -20,6 +20,7 @@ from rack.backplane.layout import Layout
 from rack.backplane.message import Message, decode_text
 from rack.backplane.segment import Segment
 from rack.boards.run.settings import has_attributes, list_attribute_names
+from rack.levels.level import Executor, Planner
 
 MAX_ITEMS = 24
 """Maximum number of array elements or items shown. Larger collections are shown as their size."""
@@ -34,29 +35,25 @@ class ObjectAttributes(dict[str, Any]):
     """Attributes of an object by name. A separate type, to distinguish them from a mapping."""
 
 
-class AttributeView:
-    """View of a level's attributes.
+def read_attributes(level: Executor | Planner) -> Mapping[str, Any]:
+    """Return the values of a level's attributes, keyed by name, as data that JSON can store.
 
-    Create it as soon as the level is built, because changes are found by comparison with the
-    attributes at that time.
+    Objects are represented by dictionaries of the attributes that have changed. For comparison, a
+    level with the same context is built. Call this in a copy of the level's process only: once the
+    attributes of an object have been listed, Python needs more time for each access to them.
     """
-
-    def __init__(self, level: object) -> None:
-        self._level = level
-        self._built = _AttributeReader().read_attributes(level, MAX_DEPTH)
-
-    def read_attributes(self) -> Mapping[str, Any]:
-        """Return the current values of the attributes, keyed by name, as data that JSON can store.
-
-        Objects are represented by dictionaries of the attributes that have changed.
-        """
-        now = _AttributeReader().read_attributes(self._level, MAX_DEPTH)
-        return _omit_missing(
-            (name, _find_changes(value, self._built.get(name)))
-            if isinstance(value, ObjectAttributes)
-            else (name, value)
-            for name, value in now.items()
-        )
+    now = _AttributeReader().read_attributes(level, MAX_DEPTH)
+    built = type(level)(level.context)
+    try:
+        before = _AttributeReader().read_attributes(built, MAX_DEPTH)
+    finally:
+        built.close()
+    return _omit_missing(
+        (name, _find_changes(value, before.get(name)))
+        if isinstance(value, ObjectAttributes)
+        else (name, value)
+        for name, value in now.items()
+    )
 
 
 def _find_changes(now: Any, built: Any) -> Any:

@@ -197,7 +197,7 @@ class Copier:
                 # The request is trusted, because it comes from the crate.
                 request: ContinueRequest | None = crate.recv()
                 if request is None:
-                    crate.send_bytes(encode_json(show()).encode())
+                    _show_attributes(crate, show)
                 elif successor := os.fork():
                     return request, successor
             except (EOFError, OSError):
@@ -224,6 +224,22 @@ class Copier:
         return resources + [
             f"it runs the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
+
+
+def _show_attributes(crate: Connection, show: Callable[[], Mapping[str, Any]]) -> None:
+    """Send the attributes of a level to the crate. Send nothing but an empty text after an error.
+
+    A child process reads them, so that this process stays as it is.
+    """
+    if child := os.fork():
+        os.waitpid(child, 0)
+        return
+    text = ""
+    try:
+        text = encode_json(show())
+    finally:
+        crate.send_bytes(text.encode())
+        os._exit(os.EX_OK)
 
 
 def _list_open_files() -> dict[int, str]:

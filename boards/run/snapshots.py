@@ -18,7 +18,7 @@ from rack.backplane.copies import copy_memory
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
-from rack.boards.run.attributes import AttributeView
+from rack.boards.run.attributes import read_attributes
 from rack.boards.run.copying import Copier
 from rack.boards.run.settings import change_settings
 from rack.boards.run.task import Task
@@ -51,7 +51,6 @@ class TaskCopies:
         self._attention = attention
         self._stopwatch = task.stopwatch
         self._copier = copier
-        self._view = AttributeView(level)
 
     def __call__(self) -> None:
         """Fork a copy, and report to the clock that it exists or that the task cannot be copied.
@@ -60,7 +59,9 @@ class TaskCopies:
         """
         block = self._block
         try:
-            request = self._copier.fork_copy(block[Block.COPY] - 1, show=self._view.read_attributes)
+            request = self._copier.fork_copy(
+                block[Block.COPY] - 1, show=partial(read_attributes, self._level)
+            )
         except SnapshotError as error:
             print(f"{NO_SNAPSHOTS_PREFIX}{error}", file=sys.stderr, flush=True)
             block[Block.COPY] = COPY_REFUSED
