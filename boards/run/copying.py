@@ -227,9 +227,9 @@ class Copier:
 
 
 def _show_attributes(crate: Connection, show: Callable[[], Mapping[str, Any]]) -> None:
-    """Send the attributes of a level to the crate. Send nothing but an empty text after an error.
+    """Send the attributes of a level to the crate, or an empty text after an error.
 
-    A child process reads them, so that this process stays as it is.
+    A child process reads them, so that the state of this process does not change.
     """
     if child := os.fork():
         os.waitpid(child, 0)

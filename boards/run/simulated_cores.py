@@ -117,7 +117,7 @@ class SimulatedCores:
             name: Name of the task.
             ready_at: Time in ns from which the job can run.
             after: The late job that the task has just ended. The task has not slept since, so it
-                keeps its place in the queue of its priority. None if it was ready or asleep.
+                keeps its place in the queue of its priority. None if it was asleep.
         """
         load = self._loads[name]
         clock_ns = self._clock_ns

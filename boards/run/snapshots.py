@@ -27,7 +27,7 @@ from rack.levels.level import Executor, Planner
 FIRST_COST_S = 0.05
 """Time for which a snapshot is assumed to stop the rack, before the first one is measured."""
 LOOK_TICKS = 50
-"""Number of ticks after which the clock checks again whether a snapshot is due at this time."""
+"""Number of ticks between two checks whether enough time has passed for a snapshot."""
 COPY_REFUSED = -1
 """Value of `Block.COPY` by which a task reports that it cannot be copied."""
 

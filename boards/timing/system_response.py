@@ -53,7 +53,7 @@ def predict_response(rack: RackTiming) -> Prediction:
 def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> list[MailboxRow]:
     """Return the rows of mailboxes that carry information along a sequence of boards.
 
-    A level computes the messages of each mailbox from those of the previous one. If no row begins
+    Each level reads one mailbox of a row and writes the next one. If no row begins
     at the first board, the longest ones that end at the last board are returned. They do not
     contain queues, because their writers determine how long messages wait in them.
 
@@ -77,7 +77,7 @@ def find_mailbox_rows(
 ) -> list[MailboxRow]:
     """Return the longest rows of mailboxes, one of each board, that end in `taken`.
 
-    A level computes the messages of each mailbox from those of the previous one. A row ends at the
+    Each level reads one mailbox of a row and writes the next one. A row ends at the
     last board. It is shorter than `boards` if none begins at the first board, and may be empty.
     """
     last = [box for box in layout.mailboxes if box.writer in boards[-1:] and box.name in taken]

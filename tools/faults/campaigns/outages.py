@@ -50,7 +50,7 @@ def count_missing_messages(
             newest = slots.heads[head & slots.mask][Slot.TICK]
             first = (spec.phase - spec.lead_ticks) % spec.every
             due = set(range(first, newest + 1, spec.every)) - skipped
-            # A babbling board has written more messages.
+            # A board that babbles has written more messages than were due.
             missing += max(0, len(due) - head)
     return missing
 

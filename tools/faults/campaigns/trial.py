@@ -43,7 +43,7 @@ STUCK_S = 20.0
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
 RERUN_CYCLES = 2
-"""Cycles of the slowest level in the run after a refused launch."""
+"""Cycles of the slowest level in the run after a refused launch, if its phase is 0."""
 
 
 class Killer:

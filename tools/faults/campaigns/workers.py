@@ -133,7 +133,7 @@ class TrialRunner:
         self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
     def start_crate(self) -> None:
-        """Start the crate for trials in lockstep before they are known. It imports the levels."""
+        """Start the crate before the first trial, so that it imports the levels meanwhile."""
         os.sched_setaffinity(0, {self._core})
         self._prepare_crate(lockstep=True)
 
