@@ -15,7 +15,7 @@ from pathlib import Path
 from resource import RLIMIT_NOFILE, RLIMIT_NPROC, getrlimit
 from struct import Struct
 from time import process_time_ns
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 ENDED_STATES = "ZX"
 """States of a process that has ended."""
@@ -84,6 +84,15 @@ def wait_readable(fd: int, timeout_s: float) -> bool:
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
     return bool(waiting.poll(max(0.0, timeout_s) * 1000))
+
+
+def write_line(file: TextIO, text: str) -> None:
+    """Write a line in one system call.
+
+    The line stays whole if other threads or processes write to the same file. `print` writes a text
+    and its end of line separately where output is not buffered.
+    """
+    os.write(file.fileno(), f"{text}\n".encode(errors="backslashreplace"))
 
 
 def busy_wait_until(processor_time_ns: int) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from rack.backplane.errors import MailboxError
-from rack.backplane.process import adopt_orphans
+from rack.backplane.process import adopt_orphans, write_line
 from rack.backplane.segment import Segment
 from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.host.bus import HostBus
@@ -101,5 +101,5 @@ def _report_failure(board: str, error: BaseException) -> int:
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = to_one_line(f"{type(error).__name__}: {error}", MAX_REASON_LENGTH)
     # The crate passes the output of host boards on to the Rack.
-    print(f"host board '{board}': {text}{place}", file=sys.stderr, flush=True)
+    write_line(sys.stderr, f"host board '{board}': {text}{place}")
     return FAILED_STATUS

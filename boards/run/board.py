@@ -22,6 +22,7 @@ from rack.backplane.process import (
     name_process,
     set_priority,
     take_core,
+    write_line,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, Scheduler, System, TaskState
@@ -73,10 +74,10 @@ def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment]
     try:
         return board(segment)
     except (BackplaneError, LevelError) as error:
-        print(f"board '{name}': {error}", file=sys.stderr, flush=True)
+        write_line(sys.stderr, f"board '{name}': {error}")
         return UNRECOVERABLE_STATUS if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
     except Exception as error:
-        print(_describe_failure(segment, name, error), file=sys.stderr, flush=True)
+        write_line(sys.stderr, _describe_failure(segment, name, error))
         return 1
 
 

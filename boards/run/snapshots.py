@@ -15,6 +15,7 @@ from functools import partial
 from rack.backplane.byte_lock import ProcessLock
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.copies import copy_memory
+from rack.backplane.process import write_line
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
@@ -63,7 +64,7 @@ class TaskCopies:
                 block[Block.COPY] - 1, show=partial(read_attributes, self._level)
             )
         except SnapshotError as error:
-            print(f"{NO_SNAPSHOTS_PREFIX}{error}", file=sys.stderr, flush=True)
+            write_line(sys.stderr, f"{NO_SNAPSHOTS_PREFIX}{error}")
             block[Block.COPY] = COPY_REFUSED
         else:
             if request is not None:
@@ -151,7 +152,7 @@ class ClockCopies:
         try:
             goes_on = self._copier.fork_copy(tick, memory) is not None
         except SnapshotError as error:
-            print(f"{NO_SNAPSHOTS_PREFIX}{error}", file=sys.stderr, flush=True)
+            write_line(sys.stderr, f"{NO_SNAPSHOTS_PREFIX}{error}")
         os.close(memory)
         words = self._segment.words
         now_s = time.monotonic()

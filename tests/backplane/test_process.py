@@ -8,6 +8,8 @@ import os
 import resource
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
+from io import TextIOWrapper
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,7 @@ from rack.backplane.process import (
     set_priority,
     take_core,
     wait_readable,
+    write_line,
 )
 from tests.machine import needs_deadlines, needs_fifo
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_until
@@ -231,3 +234,20 @@ def test_a_child_dies_with_its_parent() -> None:
     assert exit_status(fork(lambda: die_with_parent(1))) == 1
     os.close(reading)
     os.close(writing)
+
+
+def test_lines_of_several_threads_stay_whole(tmp_path: Path) -> None:
+    """As boards print, which run under `python -u`, into the one file of their crate."""
+    path = tmp_path / "printed"
+    names = [str(number) * 20 for number in range(8)]
+    with (
+        TextIOWrapper(path.open("wb", buffering=0), write_through=True) as file,
+        ThreadPoolExecutor(8) as threads,
+    ):
+
+        def print_often(name: str) -> None:
+            for _ in range(300):
+                write_line(file, name)
+
+        list(threads.map(print_often, names))
+    assert sorted(path.read_text().splitlines()) == sorted(names * 300)

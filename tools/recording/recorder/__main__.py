@@ -18,6 +18,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
 
+from rack.backplane.process import write_line
 from rack.levels.references import import_reference
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def main() -> None:
                 view.hurry()
     except OSError as error:
         tick = segment.words[System.FOLLOWER_TICK]
-        print(format_write_failure(Path(folder), error, tick), file=sys.stderr, flush=True)
+        write_line(sys.stderr, format_write_failure(Path(folder), error, tick))
         os._exit(UNWRITABLE)
 
 
@@ -103,7 +104,7 @@ def _print_message(text: str) -> None:
     """Print a line for the launcher, if it still runs."""
     # If the launcher was killed, the files must still be finished.
     with suppress(OSError):
-        print(text, flush=True)
+        write_line(sys.stdout, text)
 
 
 if __name__ == "__main__":
