@@ -8,6 +8,7 @@ same as if it had begun at tick 0.
 from __future__ import annotations
 
 import sys
+from collections.abc import Set
 
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
@@ -20,6 +21,11 @@ EVERY_S = 5.0
 """Simulated time between two snapshots. On average a trial repeats half of it."""
 
 
+def count_base_ticks(config: RackConfig) -> int:
+    """Return the number of ticks between two snapshots of the faultless rack."""
+    return max(1, round(EVERY_S * 1e9 / config.clock_ns))
+
+
 class BaseRack:
     """The faultless rack of one worker process.
 
@@ -29,17 +35,21 @@ class BaseRack:
     def __init__(self, config: RackConfig, name: str) -> None:
         self.name = name
         self._config = config
+        self._every = count_base_ticks(config)
         self._crate: WarmCrate | None = None
         self._trial = Trial(NOMINAL)
         self._reached = 0
         self._why_none = config.outside_state
 
-    def find_start(self, plan: Plan, crate: WarmCrate | None) -> Start:
+    def find_start(
+        self, plan: Plan, crate: WarmCrate | None, cores: Set[int] = frozenset()
+    ) -> Start:
         """Return the starting point of a trial. Run the faultless rack up to there if necessary.
 
         Args:
             plan: Plan of the trial.
             crate: Crate of the worker. None if it has none.
+            cores: As in `run_trial`.
         """
         if not (plan.faults or plan.kills):
             return Start()
@@ -47,14 +57,25 @@ class BaseRack:
             return Start(whole="real time")
         if not plan.first_tick:
             return Start(whole="a fault prevents the launch")
-        if not self._why_none:
-            # Include the tick, so that a snapshot before it is taken.
-            self.run(crate, (plan.first_tick + 1) * self._config.clock_ns * 1e-9)
+        self.prepare(crate, plan.first_tick, cores)
         if self._why_none:
             return Start(whole=f"{NO_SNAPSHOTS_PREFIX}{self._why_none}")
         return Start(continues=self._continue_before(plan.first_tick), events=self._trial.events)
 
-    def run(self, crate: WarmCrate, seconds: float | None) -> Trial:
+    def prepare(self, crate: WarmCrate, tick: int = 0, cores: Set[int] = frozenset()) -> None:
+        """Run the faultless rack as far as the last snapshot before a tick, if it can have one.
+
+        Args:
+            crate: Crate of the worker.
+            tick: The tick.
+            cores: As in `run_trial`.
+        """
+        if not self._why_none:
+            # Include the tick of the snapshot, so that it is taken.
+            ticks = tick - tick % self._every + 1
+            self.run(crate, ticks * self._config.clock_ns * 1e-9, cores)
+
+    def run(self, crate: WarmCrate, seconds: float | None, cores: Set[int] = frozenset()) -> Trial:
         """Return the faultless trial, run at least for a time in this crate.
 
         The trial continues from its last snapshot if it is not long enough yet.
@@ -62,6 +83,7 @@ class BaseRack:
         Args:
             crate: Crate of the worker, which keeps the snapshots.
             seconds: Simulated time in s after which the run ends. None to run until the task ends.
+            cores: As in `run_trial`.
         """
         if self._crate is not crate:
             self._crate = crate
@@ -69,16 +91,15 @@ class BaseRack:
         ticks = sys.maxsize if seconds is None else round(seconds * 1e9 / self._config.clock_ns)
         if self._reached >= ticks:
             return self._trial
-        every = max(1, round(EVERY_S * 1e9 / self._config.clock_ns))
         start = Start()
         if not self._why_none:
             start = Start(
                 continues=self._continue_before(self._reached) if self._reached else None,
-                snapshots=SnapshotPolicy(part=0, every=every),
+                snapshots=SnapshotPolicy(part=0, every=self._every),
                 events=self._trial.events,
             )
         self._trial = run_trial(
-            self._config, NOMINAL, self.name, 0, seconds, start=start, crate=crate
+            self._config, NOMINAL, self.name, 0, seconds, start=start, crate=crate, cores=cores
         )
         self._reached = ticks
         reasons = (

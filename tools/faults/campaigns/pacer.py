@@ -220,13 +220,12 @@ class ForesightedJudge(Judge):
         if strike.tick < 0 and ends >= tick:
             return retry_tick
         certain_tick = self._find_last_effect(strike, ends) + 1
-        if not strike.record.consequence.ends_process:
-            # Once the rack has recovered, only late reports of the fault's last effects may follow.
-            quiet_tick = certain_tick - self._compute_recovery(strike)
-            if tick < quiet_tick:
-                return quiet_tick
-            if _is_handled(judgement):
-                certain_tick = max(quiet_tick, self._find_last_report() + self._settle + 1)
+        # Once the rack has recovered, only late reports of the fault's last effects may follow.
+        quiet_tick = certain_tick - self._compute_recovery(strike)
+        if tick < quiet_tick:
+            return quiet_tick
+        if _is_handled(judgement):
+            certain_tick = max(quiet_tick, self._find_last_report() + self._settle + 1)
         if certain_tick > tick:
             return min(certain_tick, retry_tick)
         # A planner may detect a fault of its plans, or write its next message, at any later time.

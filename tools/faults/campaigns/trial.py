@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +17,7 @@ from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
+from rack.boards.config import resolve_layout
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
@@ -42,8 +43,6 @@ STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Shortest interval at which the tick is checked, and the interval in lockstep."""
-RERUN_CYCLES = 2
-"""Cycles of the slowest level in the run after a refused launch, if its phase is 0."""
 
 
 class Killer:
@@ -191,6 +190,7 @@ def run_trial(
     *,
     start: Start = Start(),
     crate: WarmCrate | None = None,
+    cores: Set[int] = frozenset(),
 ) -> Trial:
     """Run a plan and return the data for its evaluation.
 
@@ -205,6 +205,7 @@ def run_trial(
         seconds: Simulated time in s after which the run ends if no task ends it.
         start: Starting point of the trial.
         crate: Crate that runs the rack and has the snapshots. None to start a new one.
+        cores: Cores on which the boards may run. Empty for the cores of the config.
 
     Raises:
         ConfigError: The plan does not fit the config.
@@ -227,6 +228,7 @@ def run_trial(
                 for event in start.events
                 if event.tick < begin and event.kind not in (*OF_LAUNCH, "end")
             )
+            _move_boards(rack.segment, cores)
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
             pacer = None
@@ -251,8 +253,9 @@ def run_trial(
         trial.run = _collect_circumstances(rack, plan)
     elif plan.faults:
         faultless = replace(plan, faults=())
-        period_ticks = max(map(config.find_period, config.board))
-        rerun_s = ((RERUN_CYCLES - 1) * period_ticks + 1) * config.clock_ns * 1e-9
+        # Run until each task has begun a cycle.
+        last_begin = max(task.phase for task in resolve_layout(config).tasks)
+        rerun_s = (last_begin + 1) * config.clock_ns * 1e-9
         trial.again = run_trial(config, faultless, rack_name, ticks, rerun_s, crate=crate).outcome
     trial.start = start
     trial.outcome = rack.outcome
@@ -290,6 +293,15 @@ def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
         has_failed=rack.outcome is not None and not rack.outcome.is_success,
         moving=tuple(motion.body for motion in config.scene.motion),
     )
+
+
+def _move_boards(segment: Segment, cores: Set[int]) -> None:
+    """Let the boards of a launched rack run on any of these cores."""
+    blocks = (segment.get_block(task.name) for task in segment.layout.tasks)
+    for pid in (segment.words[System.CLOCK_PID], *(block[Block.PID] for block in blocks)):
+        with suppress(ProcessLookupError):
+            if pid and cores:
+                os.sched_setaffinity(pid, cores)
 
 
 def _watch_run(

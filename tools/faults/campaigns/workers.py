@@ -11,7 +11,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import active_children, get_context
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 from rack.backplane.process import die_with_parent
@@ -20,7 +19,7 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import build_preload_request
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.faults.campaigns.base import BaseRack
+from rack.tools.faults.campaigns.base import BaseRack, count_base_ticks
 from rack.tools.faults.campaigns.plan import NOMINAL, Plan
 from rack.tools.faults.campaigns.results import save_result
 from rack.tools.faults.campaigns.trial import Start, run_trial
@@ -54,21 +53,22 @@ class Workers:
     """
 
     def __init__(self, config: RackConfig, whole: bool = False) -> None:
+        self._late_ticks = count_base_ticks(config)
         context = get_context("spawn")
-        cores = sorted(os.sched_getaffinity(0))
-        numbers = context.SimpleQueue()
-        for core in cores:
-            numbers.put(core)
-        self._most = len(cores)
-        self._pool = ProcessPoolExecutor(
-            self._most,
-            mp_context=context,
-            initializer=_prepare_worker,
-            initargs=(config, whole, numbers, os.getpid()),
-        )
-        for _ in cores:
+        # One pool for each process, because not all have the same snapshots. The first process runs
+        # the faultless trial.
+        self._pools = [
+            ProcessPoolExecutor(
+                1,
+                mp_context=context,
+                initializer=_prepare_worker,
+                initargs=(config, whole, core, os.getpid()),
+            )
+            for core in sorted(os.sched_getaffinity(0))
+        ]
+        for pool in self._pools:
             # Start all processes now, so that they import modules while the campaign is prepared.
-            self._pool.submit(_start_crate)
+            pool.submit(_start_crate)
 
     def __enter__(self) -> Workers:
         return self
@@ -76,8 +76,9 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._stop()
-        # Idle workers, and their crates, end with the pool.
-        self._pool.shutdown(cancel_futures=True)
+        # Idle workers, and their crates, end with the pools.
+        for pool in self._pools:
+            pool.shutdown(cancel_futures=True)
 
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
         """Run trials and yield each one when its file is written.
@@ -93,15 +94,24 @@ class Workers:
             Failure: A trial could not be run.
         """
         waiting = list(jobs)
-        busy = dict[Future[str], TrialJob]()
-        max_busy = 1 if alone else self._most
+        busy = dict[Future[str], tuple[TrialJob, ProcessPoolExecutor]]()
+        idle = self._pools[:1] if alone else list(self._pools)
+        for pool in idle[len(jobs) :]:
+            # A process without a trial prepares for the next ones.
+            pool.submit(_prepare_base)
         while (waiting or busy) and not INTERRUPT.number:
-            while waiting and len(busy) < max_busy:
-                job = waiting.pop(0)
-                busy[self._pool.submit(_run_job, job)] = job
+            while waiting and idle:
+                pool = idle.pop(0)
+                # Let the first process run trials that begin late, for which others would first
+                # have to run the faultless rack.
+                find = max if pool is self._pools[0] else min
+                job = find(waiting, key=lambda job: job.plan.first_tick // self._late_ticks)
+                waiting.remove(job)
+                busy[pool.submit(_run_job, job)] = job, pool
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
-                job = busy.pop(future)
+                job, pool = busy.pop(future)
+                idle.append(pool)
                 try:
                     error_text = future.result()
                 except BrokenProcessPool:
@@ -137,20 +147,35 @@ class TrialRunner:
         os.sched_setaffinity(0, {self._core})
         self._prepare_crate(lockstep=True)
 
+    def prepare_base(self) -> None:
+        """Run the beginning of the faultless rack, from which most trials continue."""
+        crate = self._prepare_crate(lockstep=True)
+        if crate is not None and not self._whole:
+            self._base.prepare(crate, cores={self._core})
+
     def run_and_save(self, job: TrialJob) -> None:
         """Run a trial and save its result. In lockstep, use one core only."""
         is_lockstep = job.plan.lockstep
-        os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
+        cores = {self._core} if is_lockstep else set()
+        os.sched_setaffinity(0, cores or self._cores)
         crate = self._prepare_crate(is_lockstep)
         base = self._base
         start = Start(whole="as asked")
         if not self._whole:
             if crate is not None and job.plan == NOMINAL:
-                save_result(base.run(crate, job.seconds), job.path)
+                # The other workers have nothing to do yet.
+                save_result(base.run(crate, job.seconds, self._cores), job.path)
                 return
-            start = base.find_start(job.plan, crate)
+            start = base.find_start(job.plan, crate, cores)
         trial = run_trial(
-            self._config, job.plan, base.name, job.ticks, job.seconds, start=start, crate=crate
+            self._config,
+            job.plan,
+            base.name,
+            job.ticks,
+            job.seconds,
+            start=start,
+            crate=crate,
+            cores=cores,
         )
         save_result(trial, job.path)
 
@@ -172,18 +197,23 @@ class TrialRunner:
 _runner: TrialRunner
 
 
-def _prepare_worker(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
+def _prepare_worker(config: RackConfig, whole: bool, core: int, parent: int) -> None:
     """Prepare a worker process. It ends with its parent and ignores Ctrl-C on the terminal."""
     global _runner
     os.setpgid(0, 0)
     INTERRUPT.install_handlers()
     die_with_parent(parent)
-    _runner = TrialRunner(config, whole, cores.get())
+    _runner = TrialRunner(config, whole, core)
 
 
 def _start_crate() -> None:
     """Start the crate of a worker process."""
     _runner.start_crate()
+
+
+def _prepare_base() -> None:
+    """Run the beginning of the faultless rack of a worker process."""
+    _runner.prepare_base()
 
 
 def _run_job(job: TrialJob) -> str:
