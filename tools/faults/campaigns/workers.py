@@ -27,6 +27,8 @@ from rack.tools.faults.campaigns.trial import Start, run_trial
 LOOK_S = 0.2
 """Maximum time until a waiting campaign notices an interrupt."""
 
+WORKER_ENDED = "its worker process has ended"
+
 
 @dataclass(frozen=True)
 class TrialJob:
@@ -66,6 +68,7 @@ class Workers:
             )
             for core in sorted(os.sched_getaffinity(0))
         ]
+        self._preparing: list[Future[None]] = []
         for pool in self._pools:
             # Start all processes now, so that they import modules while the campaign is prepared.
             pool.submit(_start_crate)
@@ -74,8 +77,10 @@ class Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is not None:
-            self._stop()
+        if kind is not None or INTERRUPT.number:
+            # The racks of their trials are removed without being stopped.
+            for process in active_children():
+                process.terminate()
         # Idle workers, and their crates, end with the pools.
         for pool in self._pools:
             pool.shutdown(cancel_futures=True)
@@ -83,12 +88,13 @@ class Workers:
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
         """Run trials and yield each one when its file is written.
 
-        After an interrupt, the trials in progress are ended and leave no file.
+        After an interrupt, the trials in progress leave no file. They end with this context.
 
         Args:
             jobs: Trials to run.
             alone: Whether each trial gets the whole machine. Otherwise each gets one core, which
-                also makes the exchange of messages between its boards faster.
+                also makes the exchange of messages between its boards faster. The faultless trial
+                gets all cores.
 
         Raises:
             Failure: A trial could not be run.
@@ -96,9 +102,11 @@ class Workers:
         waiting = list(jobs)
         busy = dict[Future[str], tuple[TrialJob, ProcessPoolExecutor]]()
         idle = self._pools[:1] if alone else list(self._pools)
-        for pool in idle[len(jobs) :]:
-            # A process without a trial prepares for the next ones.
-            pool.submit(_prepare_base)
+        if alone:
+            wait(self._preparing)
+        elif jobs:
+            # Processes without a trial prepare for the next ones.
+            self._preparing += [pool.submit(_prepare_base) for pool in idle[len(jobs) :]]
         while (waiting or busy) and not INTERRUPT.number:
             while waiting and idle:
                 pool = idle.pop(0)
@@ -107,7 +115,7 @@ class Workers:
                 find = max if pool is self._pools[0] else min
                 job = find(waiting, key=lambda job: job.plan.first_tick // self._late_ticks)
                 waiting.remove(job)
-                busy[pool.submit(_run_job, job)] = job, pool
+                busy[_submit(pool, job)] = job, pool
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job, pool = busy.pop(future)
@@ -115,17 +123,22 @@ class Workers:
                 try:
                     error_text = future.result()
                 except BrokenProcessPool:
-                    error_text = "its worker process has ended"
+                    error_text = WORKER_ENDED
                 if error_text:
                     raise Failure(f"trial {job.plan.number} failed: {error_text}")
                 yield job
-        if busy:
-            self._stop()
 
-    def _stop(self) -> None:
-        """Terminate the workers. The racks of their trials are removed without being stopped."""
-        for process in active_children():
-            process.terminate()
+
+def _submit(pool: ProcessPoolExecutor, job: TrialJob) -> Future[str]:
+    """Let a worker process run a trial.
+
+    Raises:
+        Failure: The process has ended.
+    """
+    try:
+        return pool.submit(_run_job, job)
+    except BrokenProcessPool:
+        raise Failure(f"trial {job.plan.number} failed: {WORKER_ENDED}") from None
 
 
 class TrialRunner:

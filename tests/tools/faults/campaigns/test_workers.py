@@ -20,6 +20,7 @@ from tests.processes import FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
 SECONDS = 0.2
+BOUND_S = 30.0
 
 
 @pytest.fixture
@@ -71,6 +72,18 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
         pytest.raises(Failure, match=r"^trial 7 failed: ConfigError: .*nobody"),
     ):
         list(workers.run([bad], alone=False))
+
+
+def test_a_worker_that_was_killed_ends_the_campaign_with_its_reason(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    with Workers(config) as workers:
+        list(workers.run([job(tmp_path, 8)], alone=False))
+        for worker in active_children():
+            worker.kill()
+            worker.join(BOUND_S)
+        with pytest.raises(Failure, match=r"^trial 9 failed: its worker process has ended"):
+            list(workers.run([job(tmp_path, 9)], alone=True))
 
 
 def test_no_trial_begins_after_a_signal(
