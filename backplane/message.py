@@ -115,18 +115,17 @@ def _complete_field(declared: Field, name: str, hint: Any) -> Field:
     return replace(declared, name=name, kind=kind, unit=unit, python=python)
 
 
-def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
-    """Create a message class whose fields are known only at run time, such as from a config.
+def make_message(name: str, base: type[B], fields: Mapping[str, Any]) -> type[B]:
+    """Create version 1 of a message class whose fields are known only at run time.
 
     Args:
         name: Name of the message.
-        version: Version of the message.
         base: Class whose fields come first.
         fields: Fields to add after those of `base`: a dictionary from the name of a field to the
             result of `field`. Each must be an integer or a group.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    message_class: Any = type(name, (base,), body, version=version, message=name)
+    message_class: Any = type(name, (base,), body, version=1, message=name)
     return message_class  # type: ignore[no-any-return]
 
 
@@ -353,13 +352,13 @@ def _can_store(kind: str, value: Any) -> bool:
 class Command(Message):
     """Base class of the commands to a level."""
 
-    id: int = field("u4", unit="1", doc="serial of the command (0: no command)")
+    id: int = integer_field("serial of the command (0: no command)")
 
 
 class Status(Message):
     """Base class of the statuses of levels."""
 
-    echo: int = field("u4", unit="1", doc="serial of the command that this status answers")
+    echo: int = integer_field("serial of the command that this status answers")
     state: State = field(doc="idle, executing, done, error or holding")
-    error: int = field("u2", unit="1", doc="error code of the level (0: none)")
+    error: int = integer_field("error code of the level (0: none)", "u2")
     reason: str = field(doc="reason for the error or the hold (empty: neither)")

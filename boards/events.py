@@ -418,15 +418,16 @@ class Ending:
 
     def find_cause(self) -> Cause:
         """Return why a run ended. Call this only if the run was not stopped by a request."""
-        if self._observer is None or self._ends_run is None:
+        if self._observer is None:
             return "time over"
         status = self._observer.peek().message
-        fields = self._segment.layout.find_mailbox(self._ends_run).fields
         is_ended = self._compute_silent_ticks() or self._is_too_long
         if status.state != State.ERROR and not is_ended:
             return "task done" if status.state == State.DONE else "time over"
         # The field `moves` of a status counts the moves of the task. A refused task has none.
-        counts_moves = any(field.name == "moves" and not field.shape for field in fields)
+        counts_moves = any(
+            field.name == "moves" and not field.shape for field in self._observer.spec.fields
+        )
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
 

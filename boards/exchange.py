@@ -48,7 +48,7 @@ def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
         for label in labels:
             fields[f"{label}_{AGE_SUFFIX}"] = field(unit="tick", doc=age)
             fields[f"{label}_{TAKEN_SUFFIX}"] = field(unit="tick", doc=taken)
-    return make_message(EXCHANGE_PORT, 1, Message, fields)
+    return make_message(EXCHANGE_PORT, Message, fields)
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,6 @@ class ActiveFault:
         """Return the value of the fault's parameter of this name."""
         return self.fault.parameters[parameter]
 
-    def build_generator(self, tick: int) -> np.random.Generator:
-        """Return the random generator for a tick. A restarted board draws the same numbers."""
-        return np.random.default_rng((self.fault.seed, tick))
-
     def recall_first_sample(self, sample: Sample) -> Sample:
         """Return the sample with which the fault began.
 
@@ -138,7 +134,9 @@ def bias_position(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
 
 def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add noise to the affected positions. Its standard deviation is the fault's `size`, in rad."""
-    noise = fault["size"] * fault.build_generator(sample.tick).standard_normal(len(fault.joints))
+    # With the tick in the seed, a restarted board draws the same numbers.
+    generator = np.random.default_rng((fault.fault.seed, sample.tick))
+    noise = fault["size"] * generator.standard_normal(len(fault.joints))
     return sample._replace(position=sample.position + noise * fault.joints), True
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import subprocess
 import sys
 import tomllib
 from importlib.metadata import version
@@ -20,6 +19,7 @@ from pathlib import Path
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.crate.line import build_environment
+from tests.processes import run_to_end
 
 FILE = Path(__file__).with_suffix(".toml")
 OFTEN = (
@@ -105,14 +105,7 @@ def digest(run: str, name: str) -> str:
 
 def machine() -> dict[str, str]:
     """Return what the bits depend on, in the environment of the boards."""
-    libm = subprocess.run(
-        [sys.executable, "-c", PROBE],
-        env=build_environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
+    libm = run_to_end([sys.executable, "-c", PROBE], 60, env=build_environment(), check=True)
     return {**{library: version(library) for library in LIBRARIES}, "libm": libm.stdout.strip()}
 
 

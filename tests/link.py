@@ -213,11 +213,6 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
     }
 
 
-def struck(entry: FaultEntry) -> int:
-    """Return the tick at which a fault has first acted."""
-    return entry.struck_tick
-
-
 MakeLink = Callable[..., Link]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
-from tests.processes import RACK
+from tests.processes import RACK, run_to_end
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("backplane", "boards", "configs", "levels", "tools")
@@ -131,13 +130,10 @@ def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
     printed."""
     command = ["taskset", "-c", str(core), *RACK, "campaign", "nasrem", "--lockstep"]
     options = ["--injections", "1", "--sizes", "0", "--seed", "1", "--seconds", SECONDS]
-    done = subprocess.run(
+    done = run_to_end(
         [*command, *options, "--kinds", ",".join(kinds), "--out", str(folder / "campaign")],
+        BOUND_S,
         cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
         env=environment(folder),
     )
     return done.returncode, done.stdout + done.stderr

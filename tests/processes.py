@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import Segment
@@ -79,6 +80,15 @@ def wait_until(condition: Callable[[], object], bound_s: float = BOUND_S) -> Non
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {bound_s:g} s")
         time.sleep(0.001)
+
+
+def run_to_end(
+    command: Sequence[str | Path], bound_s: float, *, check: bool = False, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end, within a bound; return its exit status and what it printed."""
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=bound_s, check=check, **options
+    )
 
 
 def start_rack(command: Sequence[str | Path], name: str, log: Path) -> subprocess.Popen[bytes]:

@@ -175,8 +175,7 @@ def test_bus_and_levels_need_no_tool_of_the_host_side() -> None:
 def test_the_ground_floor_stands_on_published_packages_alone() -> None:
     allowed = set(sys.stdlib_module_names) | {"rack.backplane", "numpy", "posix_ipc", "xxhash"}
     ground = [path for path in SOURCES if path.is_relative_to(ROOT / "backplane")]
-    other = set().union(*map(packages, ground)) - allowed
-    assert not other
+    assert not (set().union(*map(packages, ground)) - allowed)
 
 
 @pytest.mark.slow
@@ -213,8 +212,7 @@ def test_the_core_needs_no_viewer_no_network_no_lab_and_no_other_system() -> Non
         needed = {file for name in imported(found.pop()) if (file := file_of(name))} - core
         core |= needed
         found += needed
-    outside = [name_of(path) for path in core if name_of(path).startswith(OUTSIDE)]
-    assert not outside
+    assert not [name_of(path) for path in core if name_of(path).startswith(OUTSIDE)]
 
 
 def test_names_used_of_modules_that_are_loaded_by_name_exist() -> None:

@@ -25,7 +25,7 @@ from tests.boards.lan.racks import ended, running, watch
 from tests.conftest import EXHAUSTIVE
 from tests.machine import needs_lab
 from tests.network_lab import Lab
-from tests.processes import RACK, wait_until
+from tests.processes import RACK, run_to_end, wait_until
 from tests.snapshots import Snapshots
 from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY
 from tests.tools.command_line import ROOT, rack
@@ -158,13 +158,10 @@ def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> N
 @needs_lab
 def test_one_command_runs_both_to_the_end_of_the_program(tmp_path: Path) -> None:
     command = [*RACK, "run", "brown", "--lockstep", "--no-record", "--json"]
-    done = subprocess.run(
+    done = run_to_end(
         [*ONE_MACHINE, *OWN_MEMORY, "sh", "-c", 'ip link set lo up; exec "$@"', "sh", *command],
+        MOST_S,
         cwd=tmp_path,
-        timeout=MOST_S,
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
     general = json.loads(done.stdout)
@@ -199,8 +196,7 @@ class Launched:
     def await_end(self) -> tuple[int, str]:
         """Return its exit status and last words, once nothing of both racks is left."""
         _, said = self.process.communicate(timeout=MOST_S)
-        left = [path.name for path in SHM_FOLDER.glob(f"*{self.name}*")]
-        assert not left
+        assert not [path.name for path in SHM_FOLDER.glob(f"*{self.name}*")]
         return self.process.returncode, said
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -21,8 +20,9 @@ from rack.boards.config import build_rack_timing, load, resolve
 from rack.boards.errors import ConfigError, LaunchError
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
+from tests.boards.config.mistakes import find_lines
 from tests.machine import needs_deadlines, needs_fifo
-from tests.processes import wait_until
+from tests.processes import run_to_end, wait_until
 
 EARLIEST = "clock.scheduler=earliest-deadline-first"
 URGENCY = "clock.scheduler=maximum-urgency-first"
@@ -105,9 +105,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("rack", "settings", "line"), MISTAKES.values(), ids=MISTAKES)
 def test_what_cannot_be_reserved_is_named(rack: str, settings: tuple[str], line: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        resolve(load(rack, [*settings] if LOAD in settings else [EARLIEST, *settings]))
-    assert line in str(error.value)
+    lines = find_lines(rack, *(() if LOAD in settings else (EARLIEST,)), *settings)
+    assert any(line in found for found in lines)
 
 
 @pytest.mark.alone
@@ -236,8 +235,7 @@ def test_the_check_predicts_which_boards_are_late_under_each_scheduler(
 
 @pytest.mark.slow
 def test_without_an_overload_no_board_misses_a_deadline() -> None:
-    light = "timing.lockstep_load=0.8"
-    assert set(run_overload(EARLIEST, light).missed.values()) == {0}
+    assert set(run_overload(EARLIEST, "timing.lockstep_load=0.8").missed.values()) == {0}
 
 
 CHANGE = [
@@ -288,11 +286,5 @@ def test_an_operator_changes_the_scheduler_of_a_starved_board(rack_name: str) ->
 @pytest.mark.thorough
 def test_the_comparison_is_the_one_on_the_page() -> None:
     script = Path(__file__).parents[1] / "configs/chimera/compare_schedulers.py"
-    ran = subprocess.run(
-        [sys.executable, script, f"name=compared-{os.getpid()}"],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    ran = run_to_end([sys.executable, script, f"name=compared-{os.getpid()}"], 120, check=True)
     assert ran.stdout in (script.parent / "README.md").read_text()

@@ -12,7 +12,7 @@ from rack.boards.config import load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
 from rack.tools.faults.ending import list_strikes
-from rack.tools.faults.judge import Circumstances, FaultVerdict, judge_faults
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judge
 
 pytestmark = pytest.mark.thorough
 
@@ -55,7 +55,7 @@ def ran(config: RackConfig) -> Skipped:
         for guard in guards
     }
     circumstances = Circumstances(layout, 0, is_lockstep=config.clock.mode == "lockstep")
-    return Skipped(judge_faults(struck, rack.events, circumstances), alarms, misses)
+    return Skipped(Judge(struck, rack.events, circumstances).judge_all(), alarms, misses)
 
 
 @RACKS

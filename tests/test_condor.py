@@ -102,8 +102,7 @@ def test_handlers_that_preempt_the_fingers_are_predicted_and_make_them_late(
     for extra, is_late in ((soon, False), ([slow], False), ([slow, *soon], True)):
         config = load("condor", [f"name={rack_name}", "clock.mode=lockstep", *settings, *extra])
         timing = build_rack_timing(config, resolve_layout(config))
-        failed = [v.subject for v in evaluate_rack(timing) if not v.holds]
-        assert failed == list(FINGERS) * is_late
+        assert [v.subject for v in evaluate_rack(timing) if not v.holds] == list(FINGERS) * is_late
         found = []
         # Runs with late fingers repeat as well.
         for _ in range(1 + is_late):

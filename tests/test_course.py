@@ -7,13 +7,13 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.processes import run_to_end
 from tests.test_examples import PROGRAMS, RACK_NAME
 from tests.tools.command_line import rack
 
@@ -59,14 +59,7 @@ def run(line: str, folder: Path) -> tuple[int, str]:
     if program == "rack":
         done = rack(*words, folder=folder)
     else:
-        done = subprocess.run(
-            [*PROGRAMS.get(program, (program,)), *words],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=BOUND_S,
-            check=False,
-        )
+        done = run_to_end([*PROGRAMS.get(program, (program,)), *words], BOUND_S, cwd=folder)
     return done.returncode, done.stdout + done.stderr
 
 

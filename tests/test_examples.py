@@ -6,13 +6,12 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.processes import RACK, own_can_channel
+from tests.processes import RACK, own_can_channel, run_to_end
 
 pytestmark = pytest.mark.thorough
 
@@ -45,7 +44,7 @@ def part_in_time() -> float:
     """Return the part of the exchanges with the drives of `can-arm` that come in time here, without
     a rack: where the page's figures are from, 98 % do."""
     command = [sys.executable, "-m", "tests.can_cost", "--json"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    done = run_to_end(command, 60, cwd=ROOT, check=True)
     return float(json.loads(done.stdout)["in_time"])
 
 
@@ -72,9 +71,7 @@ def test_example_runs_as_its_readme_says(
             # The machine may be too busy to be in time.
             unrecorded += ["--set", "supervision.max_missed_fraction=1"]
         command = [*PROGRAMS[program], *words, *unrecorded]
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=bound_s, check=False
-        )
+        done = run_to_end(command, bound_s, cwd=folder)
         assert done.returncode == 0, (
             f"{program} {' '.join(words)}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
         )

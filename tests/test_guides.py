@@ -15,7 +15,7 @@ from textwrap import dedent
 import pytest
 
 from tests.pages import GUIDES, ROOT
-from tests.processes import wait_until
+from tests.processes import run_to_end, wait_until
 from tests.test_course import is_shown
 from tests.tools.command_line import rack
 
@@ -97,15 +97,8 @@ class PageShell:
 
     def run(self, *words: str) -> tuple[int, str]:
         """Run a program; return its exit status and what it printed."""
-        done = subprocess.run(
-            words,
-            cwd=self.folder,
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=BOUND_S,
-            check=False,
+        done = run_to_end(
+            words, BOUND_S, cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL
         )
         return done.returncode, (done.stdout + done.stderr).replace(self.own, "nasrem")
 

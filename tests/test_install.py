@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 import sys
 import sysconfig
 import tomllib
@@ -14,6 +13,8 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+
+from tests.processes import run_to_end
 
 pytestmark = pytest.mark.thorough
 
@@ -53,14 +54,8 @@ executor = "levels.counter:Counter"
 
 def run(folder: Path, *command: str | Path) -> str:
     # Code that is compiled for the copy goes with it.
-    done = subprocess.run(
-        command,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-        env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")},
+    done = run_to_end(
+        command, 100, cwd=folder, env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -146,14 +141,7 @@ def test_a_folder_called_rack_is_not_taken_for_the_project(tmp_path: Path) -> No
 
 
 def answer(program: Path, **environment: str) -> tuple[int, str]:
-    done = subprocess.run(
-        (program, "list"),
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-        env={**os.environ, **environment},
-    )
+    done = run_to_end((program, "list"), 100, env={**os.environ, **environment})
     return done.returncode, done.stdout + done.stderr
 
 

@@ -24,7 +24,7 @@ import pytest
 from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.pages import BLOCK, README, REFERENCES, ROOT, SHELL
-from tests.processes import RACK, wait_until
+from tests.processes import RACK, run_to_end, wait_until
 from tests.tools.command_line import BOUND_S, rack
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
@@ -279,14 +279,7 @@ def run_program(program: str, folder: Path) -> str:
     own = own.replace('{"seed"', f'{{"name": "{OWN_NAME}", "seed"')
     own = own.replace('attach("nasrem")', f'attach("{OWN_NAME}")')
     (folder / "program.py").write_text(own)
-    done = subprocess.run(
-        [sys.executable, "program.py"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
+    done = run_to_end([sys.executable, "program.py"], BOUND_S, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -4,7 +4,6 @@ time."""
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.crate.line import TUNABLES
+from tests.processes import run_to_end
 
 pytestmark = pytest.mark.thorough
 
@@ -54,13 +54,11 @@ print(hashlib.sha256(b"".join(np.asarray(value).tobytes() for value in found)).h
 
 def arithmetic(settings: dict[str, str]) -> str:
     """Return a digest of what comes out, in a process that takes the processor for another."""
-    done = subprocess.run(
+    done = run_to_end(
         [sys.executable, "-c", ARITHMETIC],
+        60,
         env={**os.environ, TUNABLES: "glibc.cpu.hwcaps=-FMA,-FMA4", **settings},
-        capture_output=True,
-        text=True,
         check=True,
-        timeout=60,
     )
     return done.stdout
 

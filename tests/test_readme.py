@@ -4,7 +4,6 @@ test. No command runs here (test_pages.py, test_guides.py), and links are tested
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -21,6 +20,7 @@ from tests.pages import (
     REFERENCES,
     ROOT,
     WITHOUT_COMMANDS,
+    list_pages,
 )
 from tests.test_course import EXERCISES
 from tests.test_examples import FOLDERS
@@ -98,9 +98,7 @@ def test_every_page_with_commands_has_a_test() -> None:
         *(f"configs/examples/{name}/README.md" for name in FOLDERS),
     }
     assert not covered & {*WITHOUT_COMMANDS}
-    listed = subprocess.run(
-        ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split()
+    listed = list_pages()
     assert {*GUIDES, *WITHOUT_COMMANDS} <= {*listed}
     shell = re.compile(r"^ *```sh$", re.MULTILINE)
     assert not [

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.pages import ROOT, list_pages
+from tests.processes import run_to_end
+
 BOUND_S = 300
 pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(BOUND_S + 20)]
 
-ROOT = Path(__file__).resolve().parent.parent
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", ".*_cache", "__pycache__", "dist", "runs")
 BROKEN = {
     "levels/gone.md": "levels/gone.md",
@@ -27,15 +29,7 @@ BROKEN = {
 def build(project: Path, site: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    return subprocess.run(
-        command,
-        cwd=project,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
+    return run_to_end(command, BOUND_S, cwd=project, env=environment)
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +41,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_site_has_every_page_and_the_code_that_pages_link_to(site: Path) -> None:
-    listed = subprocess.run(
-        ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split()
-    made = [Path(name).with_suffix(".html") for name in listed]
+    made = [Path(name).with_suffix(".html") for name in list_pages()]
     made = [path.with_name("index.html") if path.stem == "README" else path for path in made]
     assert not [str(path) for path in made if not (site / path).exists()]
     assert "class VirtualControlLoop" in re.sub(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.processes import run_to_end
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
@@ -67,9 +68,7 @@ def main() -> None:
 def test_a_type_checker_knows_ports_and_messages_of_a_users_level(tmp_path: Path) -> None:
     (tmp_path / "meter.py").write_text(OWN)
     command = [sys.executable, "-m", "mypy", "--strict", "--no-pretty", "meter.py"]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
+    done = run_to_end(command, BOUND_S, cwd=tmp_path)
     said = dict(re.findall(r"^meter\.py:(\d+): (.*)$", done.stdout, re.MULTILINE))
     expected = {
         str(number): line.partition("  # ")[2]

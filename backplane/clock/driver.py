@@ -189,11 +189,6 @@ class ClockDriver(ABC):
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
         return bool(stop) and tick >= stop
 
-    @property
-    def launcher_is_alive(self) -> bool:
-        """True if the launcher is alive."""
-        return self._segment.launcher_is_alive
-
     def end_run(self) -> None:
         """Publish that the run has ended, and wake every task so that it notices."""
         self.words[System.STATE] = Run.STOPPED
@@ -233,7 +228,7 @@ class RealtimeDriver(ClockDriver):
         while not self.is_over(tick):
             if self.begin_tick(tick):
                 self._release_tasks(tick, last)
-                if tick // beat != last // beat and not self.launcher_is_alive:
+                if tick // beat != last // beat and not self._segment.launcher_is_alive:
                     break
                 last = tick
             tick = self._sleep_until_next(tick)

@@ -247,7 +247,7 @@ class LockstepDriver(ClockDriver):
         Returns:
             False if the launcher has ended or the host requests the end of the run.
         """
-        if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
+        if not self._segment.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
         # Lockstep does not wait for a process that has been stopped by a signal.
         task.check_stopped()
@@ -270,7 +270,7 @@ class LockstepDriver(ClockDriver):
                 since = time.monotonic()
             elif time.monotonic() - since > MAX_RECORDER_WAIT_S:
                 words[System.FOLLOWER_PID] = 0
-            if words[System.STOP_REQUEST] or not self.launcher_is_alive:
+            if words[System.STOP_REQUEST] or not self._segment.launcher_is_alive:
                 return False
             time.sleep(POLL_S)
         return True
@@ -298,7 +298,7 @@ class LockstepDriver(ClockDriver):
         self.alarms.wake_rack()
         wait_s = POLL_S
         while 0 < words[System.HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
-            if not self.launcher_is_alive:
+            if not self._segment.launcher_is_alive:
                 return False
             time.sleep(wait_s)
             wait_s = min(2.0 * wait_s, MAX_POLL_S)

@@ -116,10 +116,12 @@ class NextCycle:
             # Read the newest release of the task, not the clock's tick, because in lockstep the
             # clock may begin a tick some time before it releases the task.
             newest = block[Block.RELEASED]
-            if self._sleeps and newest >= self._due and self._is_before_grid_point(newest):
-                # The clock gives releases ahead of their grid points. Do not take this one yet, but
-                # take the previous one if that has not expired.
-                newest -= self._spec.every
+            if self._sleeps and newest >= self._due:
+                point = words[System.EPOCH_NS] + newest * words[System.PERIOD_NS]
+                if monotonic_ns() < point:
+                    # The clock gives releases ahead of their grid points. Do not take this one yet,
+                    # but take the previous one if that has not expired.
+                    newest -= self._spec.every
             if newest >= self._due:
                 if is_posted and newest != self._newest:
                     # The task did not have to wait for this release or batch, so its post is still
@@ -151,12 +153,6 @@ class NextCycle:
         if self._silent_clock is not None:
             self._silent_clock.record_release()
         return release
-
-    def _is_before_grid_point(self, release: int) -> bool:
-        """Check whether the grid point of a release is in the future."""
-        return (
-            monotonic_ns() < self._words[System.EPOCH_NS] + release * self._words[System.PERIOD_NS]
-        )
 
     def _sleep_until_release(self) -> bool:
         """Sleep until the grid point of the next release.

@@ -26,7 +26,7 @@ from rack.backplane.mailbox.slots import (
 )
 from rack.backplane.ring import NewRows, Ring
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, System
+from rack.backplane.words import Box
 
 HEAD_WORDS = {
     "stamp_ns": "i8",
@@ -139,16 +139,14 @@ def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
     return chain_by_mailbox
 
 
-def compute_digest(segment: Segment, until: int | None = None) -> str:
+def compute_digest(segment: Segment, until: int) -> str:
     """Compute the digest of a run, a text of 32 hexadecimal digits.
 
     Args:
         segment: Memory of the rack.
-        until: Messages that became visible at this tick or later are ignored. None for the tick at
-            which the run stopped.
+        until: Messages that became visible at this tick or later are ignored.
     """
-    stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)
-    for name, (serial, chain) in sorted(find_chains(segment, stop).items()):
+    for name, (serial, chain) in sorted(find_chains(segment, until).items()):
         total.update(f"{name} {serial} {chain} ".encode())
     return total.hexdigest()

@@ -27,10 +27,6 @@ from rack.backplane.words import Box
 class HostWriter(DoubleBufferWriter):
     """Writer of a host board's ring. Like any writer, it claims the mailbox."""
 
-    def __init__(self, segment: Segment, name: str) -> None:
-        super().__init__(segment, name)
-        self._box = self.slots.box
-
     def send_message(self, tick: int) -> bool:
         """Publish `message`, unless the ring is full.
 
@@ -40,8 +36,9 @@ class HostWriter(DoubleBufferWriter):
         Returns:
             False if the ring is full. The message is dropped and counted as refused.
         """
-        if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
-            self._box[Box.REFUSED] += 1
+        box = self.slots.box
+        if box[Box.HEAD] - box[Box.TAKEN] >= self.spec.capacity:
+            box[Box.REFUSED] += 1
             return False
         return self.write(tick)
 

@@ -62,10 +62,6 @@ class InterruptWriter(Writer):
     A message must be written before the tick at which it is due (`InterruptSpec.due`).
     """
 
-    def __init__(self, segment: Segment, name: str) -> None:
-        super().__init__(segment, name)
-        self._due = get_interrupt_spec(self.spec).due
-
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which a message is visible.
 

@@ -96,7 +96,8 @@ class Writer:
         self.spec = spec = segment.layout.find_mailbox(name)
         self.slots = Slots(segment, spec)
         self._delay = spec.delay
-        self._due = spec.delay  # ticks from a release until its message must be written
+        # Ticks from a release until its message must be written.
+        self._due = spec.delay if spec.interrupt is None else spec.interrupt.due
         self.message = self.slots.message
         self.bus_errors = 0
         self.held_up = 0

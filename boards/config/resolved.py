@@ -84,11 +84,6 @@ def resolve_layout(config: RackConfig) -> Layout:
     return _examine(config).build_resolved_rack().layout
 
 
-def list_class_names(config: RackConfig) -> tuple[str, ...]:
-    """Return the classes of all executors and planners, as "package.module:Class"."""
-    return tuple(dict.fromkeys(place.target for place in config.list_tasks()))
-
-
 @dataclass(frozen=True)
 class Resolved:
     """A checked config and the records that a launch derives from it.

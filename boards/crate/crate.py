@@ -287,7 +287,7 @@ class Crate:
 
     def _report_fork_failure(self, name: str, why: str) -> None:
         """Mark a board that could not be forked as lost, and report it to the Rack."""
-        end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
+        end = Ended(name, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
 
@@ -409,7 +409,7 @@ class Crate:
                 self._kill_orphans()
                 self._outputs[name].copy_output(is_over=True)
             with suppress(OSError):
-                self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
+                self._line.send(Ended(name, os.waitstatus_to_exitcode(status), seen_ns, tick))
         if self._shelf.line in ready:
             self._receive_copy_message()
         return ready

@@ -19,7 +19,7 @@ from rack.backplane.standby import list_standbys
 from rack.backplane.words import Block, System
 from rack.boards.config.commands import build_request, parse_command
 from rack.boards.config.loader import load
-from rack.boards.config.resolved import Resolved, list_class_names, resolve
+from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate import launch_checks
 from rack.boards.crate.clean import remove_dead_rack, remove_own_racks
@@ -373,4 +373,5 @@ def build_preload_request(config: RackConfig) -> Preload:
     """Return the request to import and preload the levels of a rack and to compile its cell."""
     robot, scene = config.robot, config.scene
     cell = None if robot is None else CellConfig(robot, scene, config.clock_ns)
-    return Preload(list_class_names(config), tuple(sys.path), cell)
+    classes = tuple(dict.fromkeys(task.target for task in config.list_tasks()))
+    return Preload(classes, tuple(sys.path), cell)

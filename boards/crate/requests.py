@@ -153,14 +153,12 @@ class Ended:
 
     Attributes:
         name: Name of the board.
-        pid: The process.
         status: Exit status. Negative for a signal, as in `subprocess`.
         seen_ns: CLOCK_MONOTONIC time in ns at which the crate noticed the end.
         tick: Tick at which the board was lost.
     """
 
     name: str
-    pid: int
     status: int
     seen_ns: int
     tick: int

@@ -108,7 +108,10 @@ class Supervisor:
                 self._handle_alarm(raised)
             for board in self._heartbeat.find_hanging():
                 self.recovery.report_hanging(board)
-                self._kill_hanging(board)
+                if board == CLOCK:
+                    self._kill_clock(self.segment.words[System.CLOCK_PID])
+                else:
+                    self.recovery.kill_hanging(board)
             self._awaited.report_if_due()
             self.recovery.restart_due_boards()
             if not self.is_armed:
@@ -141,13 +144,6 @@ class Supervisor:
             if is_early and not is_disturbed:
                 why = f"the level is not deterministic: {raised.event.text}, at the start"
                 raise ConfigError([Mistake(f"board.{board}.compare", True, why)])
-
-    def _kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, or the process that runs the clock."""
-        if board == CLOCK:
-            self._kill_clock(self.segment.words[System.CLOCK_PID])
-        else:
-            self.recovery.kill_hanging(board)
 
     def _kill_clock(self, pid: int) -> None:
         """Kill a process if it is the clock or its standby."""
@@ -199,7 +195,7 @@ class Supervisor:
         match message:
             case Forked(name, pid):
                 self.pids[name] = pid
-            case Ended(name, _, status) as end:
+            case Ended(name, status) as end:
                 self.pids.pop(name, None)
                 is_board = name in CLOCKS or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None

@@ -244,10 +244,8 @@ class FaultStage:
         """
         self.injected = self._words[System.INJECTED]
         faults = self._table.list_entries(OPEN_STAGES)
-        active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
-        waiting = [entry for entry in faults if entry.stage == Stage.WAITING]
-        over = [entry for entry in active if self._is_over(entry, tick)]
-        due = [entry for entry in waiting if self._is_due(entry, tick)]
+        over = [e for e in faults if e.stage == Stage.ACTIVE and self._is_over(e, tick)]
+        due = [e for e in faults if e.stage == Stage.WAITING and self._is_due(e, tick)]
         if over or due:
             # Faults must not change during a cycle, so wait until the running cycles are finished.
             self.driver.wait_until_settled()

@@ -204,7 +204,7 @@ class WrongOutput(MessageStep):
     def send_message(self, message: Outgoing) -> None:
         """Pass a wrong message on."""
         content = message.content or self.writer.message.raw
-        self.onward(message._replace(content=bytes(self.change_content(message.at, content))))
+        self.onward(message._replace(content=self.change_content(message.at, content)))
 
 
 class Babble(MessageStep):

@@ -245,4 +245,4 @@ class HostTurn(ReleasedTask):
 def build_status_class(entries: Mapping[str, EntryConfig]) -> type[Status]:
     """Return the class of an adapter's status, with a group of counters for each entry."""
     groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
-    return make_message("adapter_status", 1, Status, groups)
+    return make_message("adapter_status", Status, groups)

@@ -13,7 +13,7 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import AnyMessage, Message, field, fill_counts
+from rack.backplane.message import AnyMessage, Message, field, fill_counts, integer_field
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import get_wake_semaphore
 from rack.backplane.words import Block
@@ -26,11 +26,6 @@ NEVER = -1
 PORT = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
 """Names that no port may have, because the status of an adapter has fields of these names."""
-
-
-def declare_counter(doc: str) -> Any:
-    """Declare a counter, whose meaning is `doc`, in the status of an adapter."""
-    return field("u4", unit="1", doc=doc)
 
 
 def zero_counts(group: type[C]) -> C:
@@ -46,15 +41,11 @@ def zero_counts(group: type[C]) -> C:
 class AdapterEntry(Message, version=1):
     """Counters of one entry, as a group of fields in the status of its adapter."""
 
-    passed: int = declare_counter("messages passed to the other side")
-    refused: int = declare_counter(
-        "messages refused: damaged, forged, or not what its type permits"
-    )
-    superseded: int = declare_counter("messages that a newer one overtook before the exchange")
-    full: int = declare_counter(
-        "messages that the host board could not send, since too many waited"
-    )
-    waiting: int = declare_counter("messages that wait for the next cycles")
+    passed: int = integer_field("messages passed to the other side")
+    refused: int = integer_field("messages refused: damaged, forged, or not what its type permits")
+    superseded: int = integer_field("messages that a newer one overtook before the exchange")
+    full: int = integer_field("messages that the host board could not send, since too many waited")
+    waiting: int = integer_field("messages that wait for the next cycles")
     arrived: int = field(
         unit="tick", doc="tick at which the newest message reached the other side (-1: none yet)"
     )

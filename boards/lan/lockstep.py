@@ -174,11 +174,10 @@ class Barrier:
         self._tick_ns = segment.layout.clock_ns
         self.cycle_ns = segment.layout.find_task(board).every * self._tick_ns
         self.last_done_tick = self._block[Block.DONE]
-        self._is_restarted = self.last_done_tick >= 0
+        self._has_begun = self.last_done_tick >= 0
         # Exports up to this time were delivered before the restart and are not delivered again.
-        self._passed_ns = self.last_done_tick * self._tick_ns if self._is_restarted else NEVER
+        self._passed_ns = self.last_done_tick * self._tick_ns if self._has_begun else NEVER
         self._is_first = True
-        self._has_begun = self._is_restarted
         self._has_refused = False
         self._block[Block.AWAITS] = 0
         self._exports: list[ReceivedMessage] = []
@@ -204,7 +203,7 @@ class Barrier:
             self._subscribers.append(
                 link.session.declare_subscriber(step_key(partner.rack), handler)
             )
-            if self._is_restarted:
+            if self._has_begun:
                 # The other adapter may have ended while this one was restarted.
                 partner.gone_s = time.monotonic()
         self._subscribers.append(

@@ -4,33 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rack.backplane.message import Message, Status, field, make_message
-from rack.boards.host.entries import declare_counter
+from rack.backplane.message import Message, Status, field, integer_field, make_message
 from rack.boards.lan.envelope import MAX_MESSAGE_BYTES
 
 
 class LanExport(Message, version=1):
     """Counters of one export in the status of the network adapter."""
 
-    sent: int = declare_counter("messages sent")
+    sent: int = integer_field("messages sent")
     serial: int = field(unit="1", doc="serial of the newest message sent, 0 if there is none")
 
 
 class LanImport(Message, version=1):
     """Counters of one import, and its newest message, in the status of the network adapter."""
 
-    taken: int = declare_counter("messages passed to the backplane")
-    missing: int = declare_counter("messages that never arrived or arrived after a later one")
-    disordered: int = declare_counter(
+    taken: int = integer_field("messages passed to the backplane")
+    missing: int = integer_field("messages that never arrived or arrived after a later one")
+    disordered: int = integer_field(
         "messages that arrived after a later one and were not passed on"
     )
-    repeated: int = declare_counter("messages that arrived twice")
-    late: int = declare_counter("messages that were older than max_age_ms when they arrived")
-    refused: int = declare_counter(
+    repeated: int = integer_field("messages that arrived twice")
+    late: int = integer_field("messages that were older than max_age_ms when they arrived")
+    refused: int = integer_field(
         "messages refused because they are malformed, unsigned, oversized or of another type"
     )
-    unknown_launch: int = declare_counter("messages of a launch that is over, or not there")
-    superseded: int = declare_counter("messages that a newer one overtook before the exchange")
+    unknown_launch: int = integer_field("messages of a launch that is over, or not there")
+    superseded: int = integer_field("messages that a newer one overtook before the exchange")
     launch: int = field(
         unit="1",
         doc="launch that wrote the newest message taken, 0 if there is none or in lockstep",
@@ -51,24 +50,24 @@ class LanImport(Message, version=1):
 class LanFlaws(Message, version=1):
     """Counters of received messages that were dropped unread, by cause."""
 
-    malformed: int = declare_counter(
+    malformed: int = integer_field(
         "not of this protocol or of another version of it, always 0 in lockstep"
     )
-    unsigned: int = declare_counter(
+    unsigned: int = integer_field(
         "changed on the way, under another key or not sealed by its sender, always 0 in lockstep"
     )
-    oversized: int = declare_counter(f"longer than {MAX_MESSAGE_BYTES} bytes, always 0 in lockstep")
+    oversized: int = integer_field(f"longer than {MAX_MESSAGE_BYTES} bytes, always 0 in lockstep")
 
 
 class LanClocks(Message, version=1):
     """Counters of the round trips by which racks compare their clocks."""
 
-    taken: int = declare_counter("round trips measured")
-    answered: int = declare_counter("pings of other racks answered")
-    withheld: int = declare_counter(
+    taken: int = integer_field("round trips measured")
+    answered: int = integer_field("pings of other racks answered")
+    withheld: int = integer_field(
         "pings not answered because they arrived too fast or from too many racks"
     )
-    refused: int = declare_counter(
+    refused: int = integer_field(
         "pings and answers refused because they are malformed, unsigned or unexpected"
     )
 
@@ -76,13 +75,13 @@ class LanClocks(Message, version=1):
 class LanDesk(Message, version=1):
     """Counters of the emergency stops that other machines requested."""
 
-    answered: int = declare_counter(
+    answered: int = integer_field(
         "emergency stops from other machines that were set, always 0 in lockstep"
     )
-    refused: int = declare_counter(
+    refused: int = integer_field(
         "emergency stops refused because they are not permitted, always 0 in lockstep"
     )
-    dropped: int = declare_counter(
+    dropped: int = integer_field(
         "requests dropped: malformed, unsigned or oversized, always 0 in lockstep"
     )
 
@@ -96,4 +95,4 @@ def build_status_class(exports: Iterable[str], imports: Iterable[str]) -> type[S
         "desk": field(LanDesk, doc="emergency stops from other machines"),
         "flaws": field(LanFlaws, doc="messages that were dropped unread, by cause"),
     }
-    return make_message("lan_status", 1, Status, groups)
+    return make_message("lan_status", Status, groups)

@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from importlib import import_module
 from socket import socket
 from zlib import crc32
@@ -30,7 +31,7 @@ from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
-from rack.boards.run.snapshots import TaskCopies, has_snapshots_enabled
+from rack.boards.run.snapshots import copy_task, has_snapshots_enabled
 from rack.boards.run.system_controller import run_clock
 from rack.boards.run.task import Task
 from rack.boards.wiring import ClockWiring, TaskWiring
@@ -160,7 +161,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         else:
             task = VirtualControlLoop(segment, wiring, level, attention)
         if copier is not None:
-            task.next_cycle.copy = TaskCopies(task, level, copier, attention)
+            task.next_cycle.copy = partial(copy_task, task, level, copier, attention)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()

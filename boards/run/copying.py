@@ -38,6 +38,8 @@ MAX_NOTE_BYTES = 4096
 """Maximum size of a `CopyMessage` as JSON."""
 MAX_NOTE_FILES = 2
 """Maximum number of descriptors sent with a `CopyMessage`."""
+ReadAttributes = Callable[[], Mapping[str, Any]]
+"""Returns the attributes of a level."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _THREADS = Path("/proc/self/task")
 
@@ -111,7 +113,7 @@ class Copier:
         self._copies: list[int] = []
 
     def fork_copy(
-        self, tick: int, *memory: int, show: Callable[[], Mapping[str, Any]] = dict
+        self, tick: int, *memory: int, show: ReadAttributes = dict
     ) -> ContinueRequest | None:
         """Fork a copy of this process. The copy waits in this call until a rack continues from it.
 
@@ -169,7 +171,7 @@ class Copier:
         crate: Connection,
         offsets: Mapping[int, int],
         seeds: Any,
-        show: Callable[[], Mapping[str, Any]],
+        show: ReadAttributes,
     ) -> tuple[ContinueRequest, int]:
         """In a copy, wait for the request to continue. Answer requests for attributes until then.
 
@@ -226,7 +228,7 @@ class Copier:
         ]
 
 
-def _show_attributes(crate: Connection, show: Callable[[], Mapping[str, Any]]) -> None:
+def _show_attributes(crate: Connection, show: ReadAttributes) -> None:
     """Send the attributes of a level to the crate, or an empty text after an error.
 
     A child process reads them, so that the state of this process does not change.

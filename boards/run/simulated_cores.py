@@ -24,31 +24,27 @@ UNKNOWN = 1 << 62
 """Value of `Block.FINISH` until the end of a job is known."""
 
 
-class CoreStep:
-    """Step of a cycle that waits until its job ends on the simulated core.
+def await_job_end(task: Task, cost_ns: int, tick: int, begin_ns: int, end_ns: int) -> int:
+    """Wait until the job of a cycle ends on the simulated core, and return its end.
 
-    A `rack.boards.run.simulated_time.FinishStep`. It must be the last step of its task.
+    With its task and `cost_ns` given, this is a `rack.boards.run.simulated_time.FinishStep`. It
+    must be the last step of the task.
 
     Args:
         task: The task.
         cost_ns: Processor time of a cycle or plan without the other steps.
+        tick: Release of the cycle.
+        begin_ns: Begin of the cycle, in simulated time.
+        end_ns: Its end after the other steps, whose processor time is added to `cost_ns`.
     """
-
-    def __init__(self, task: Task, cost_ns: int) -> None:
-        self._task = task
-        self._cost_ns = cost_ns
-
-    def __call__(self, tick: int, begin_ns: int, end_ns: int) -> int:
-        """Return the end of the job. Its processor time includes that of the other steps."""
-        task = self._task
-        task.block[Block.COMPUTING_NS] = self._cost_ns + end_ns - begin_ns
-        task.next_cycle.wait_for_tick(UNKNOWN)
-        end_ns = task.block[Block.COMPUTING_NS]
-        if task.words[System.STATE] == Run.STOPPED:
-            # The job is late if its deadline is not after the run.
-            end_ns = (task.words[System.TICK] + 1) * task.simulated.clock_ns
-        task.stopwatch.core_ns = max(begin_ns, task.block[Block.BEGUN_NS]), end_ns
-        return end_ns
+    task.block[Block.COMPUTING_NS] = cost_ns + end_ns - begin_ns
+    task.next_cycle.wait_for_tick(UNKNOWN)
+    end_ns = task.block[Block.COMPUTING_NS]
+    if task.words[System.STATE] == Run.STOPPED:
+        # The job is late if its deadline is not after the run.
+        end_ns = (task.words[System.TICK] + 1) * task.simulated.clock_ns
+    task.stopwatch.core_ns = max(begin_ns, task.block[Block.BEGUN_NS]), end_ns
+    return end_ns
 
 
 class SimulatedCores:
@@ -135,7 +131,6 @@ class SimulatedCores:
             every, cost_ns = task.spec.slice, block[Block.COMPUTING_NS]
         job = CoreJob(
             name,
-            release,
             self._find_scheduler(name),
             load.priority,
             load.is_critical,

@@ -41,41 +41,34 @@ def has_snapshots_enabled(segment: Segment) -> bool:
     )
 
 
-class TaskCopies:
-    """Forks a copy of one task between two of its cycles, when the clock requests one."""
+def copy_task(task: Task, level: Executor | Planner, copier: Copier, attention: int) -> None:
+    """Fork a copy of a task between two of its cycles, when the clock requests one.
 
-    def __init__(
-        self, task: Task, level: Executor | Planner, copier: Copier, attention: int
-    ) -> None:
-        self._block = task.block
-        self._level = level
-        self._attention = attention
-        self._stopwatch = task.stopwatch
-        self._copier = copier
+    The clock is told that the copy exists, or that the task cannot be copied. In the copy, this
+    returns when a rack continues from it.
 
-    def __call__(self) -> None:
-        """Fork a copy, and report to the clock that it exists or that the task cannot be copied.
-
-        In the copy, this returns when a rack continues from it.
-        """
-        block = self._block
-        try:
-            request = self._copier.fork_copy(
-                block[Block.COPY] - 1, show=partial(read_attributes, self._level)
-            )
-        except SnapshotError as error:
-            write_line(sys.stderr, f"{NO_SNAPSHOTS_PREFIX}{error}")
-            block[Block.COPY] = COPY_REFUSED
-        else:
-            if request is not None:
-                if request.context is not None:
-                    change_settings(self._level, request.context)
-                block[Block.PID] = os.getpid()
-                block[Block.STATE] = TaskState.RUNNING
-                self._stopwatch.start_counting()
-                os.eventfd_write(self._attention, 1)
-            block[Block.COPY] = 0
-        self._stopwatch.notify_clock()
+    Args:
+        task: The task.
+        level: The level that it runs.
+        copier: Forks copies of its process.
+        attention: Event descriptor that wakes the Rack.
+    """
+    block = task.block
+    try:
+        request = copier.fork_copy(block[Block.COPY] - 1, show=partial(read_attributes, level))
+    except SnapshotError as error:
+        write_line(sys.stderr, f"{NO_SNAPSHOTS_PREFIX}{error}")
+        block[Block.COPY] = COPY_REFUSED
+    else:
+        if request is not None:
+            if request.context is not None:
+                change_settings(level, request.context)
+            block[Block.PID] = os.getpid()
+            block[Block.STATE] = TaskState.RUNNING
+            task.stopwatch.start_counting()
+            os.eventfd_write(attention, 1)
+        block[Block.COPY] = 0
+    task.stopwatch.notify_clock()
 
 
 class ClockCopies:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from time import process_time_ns
 from typing import ClassVar, ParamSpec, TypeVar
@@ -89,8 +90,8 @@ class Task(ABC):
             # Import it only in racks that need it.
             # The step of an interrupt handler includes the budget of the cycle.
             cost_ns = 0 if handler else wiring.scheduling.cost_ns
-            step = import_module(SIMULATED_CORES).CoreStep(self, cost_ns)
-            self.simulated.steps.append(step)
+            await_job_end = import_module(SIMULATED_CORES).await_job_end
+            self.simulated.steps.append(partial(await_job_end, self, cost_ns))
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:

@@ -15,7 +15,6 @@ class CoreJob:
 
     Attributes:
         task: Name of the task.
-        release: Its release, as a tick.
         scheduler: Scheduler of the task.
         priority: Fixed priority of the task.
         is_critical: Whether the task is critical.
@@ -30,7 +29,6 @@ class CoreJob:
     """
 
     task: str
-    release: int
     scheduler: Scheduler
     priority: int
     is_critical: bool

@@ -260,9 +260,11 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     )
     for fraction, jerk_fraction in STOP_EFFORTS:
-        stop = _build_ramp(
+        request = _build_ruckig_input(
             state, max(fraction * max_acceleration, abs(state.dds)), jerk_fraction * max_jerk
         )
+        request.control_interface = ruckig.ControlInterface.Velocity
+        stop = _join_sections(_run_ruckig(request), state.s)
         if stop.end <= end and _is_within_limits(stop, path, limits):
             return stop
     return None
@@ -321,13 +323,6 @@ def _build_sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> It
         else:
             lasts_s = length / before if before > 0.0 else np.inf
             yield (lasts_s, start, before, 0.0, 0.0)
-
-
-def _build_ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
-    """Return the fastest ramp from `state` to rest with the given limits, in rad/s2 and rad/s3."""
-    request = _build_ruckig_input(state, acceleration, jerk)
-    request.control_interface = ruckig.ControlInterface.Velocity
-    return _join_sections(_run_ruckig(request), state.s)
 
 
 def _build_ruckig_input(

@@ -85,7 +85,7 @@ class InverseKinematics:
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
-            error = self._compute_error(target, q)
+            error = self.compute_tool_pose(q).compute_error(target)
             if not match_orientation:
                 error[3:] = 0.0
             if (np.abs(error) < TOLERANCE).all():
@@ -105,11 +105,9 @@ class InverseKinematics:
     def find_nearby(self, target: Pose, start: Array) -> Array | None:
         """Return a configuration that reaches `target` on the same branch as `start`, or None."""
         solution = self.find_configuration(target, start)
-        return (
-            solution
-            if solution is not None and bool(np.all(np.abs(solution - start) < MAX_BRANCH_STEP_RAD))
-            else None
-        )
+        if solution is None or not np.all(np.abs(solution - start) < MAX_BRANCH_STEP_RAD):
+            return None
+        return solution
 
     def find_free_solutions(
         self,
@@ -168,18 +166,6 @@ class InverseKinematics:
     def compute_travel_time(self, start: Array, end: Array) -> float:
         """Return the time in s that the slowest joint needs at its velocity limit."""
         return float(np.max(np.abs(start - end) * self._pace))
-
-    def _compute_error(self, target: Pose, q: Array) -> Array:
-        """Return the error of the tool's pose at a configuration.
-
-        Args:
-            target: Pose for the tool.
-            q: Configuration, (joints,), rad.
-
-        Returns:
-            Distance, m, then rotation, rad, (6,).
-        """
-        return self.compute_tool_pose(q).compute_error(target)
 
     def _compute_step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
         """Return the bounded step that best reduces the error.

@@ -50,24 +50,21 @@ class Move(NamedTuple):
         record["by"] = self.by_s
 
 
-def read_move(record: Any) -> Move:
-    """Return a copy of the move in one element of an array of `ElementalMove`."""
-    row = int(record["object"])
-    return Move(
-        id=int(record["id"]),
-        action=int(record["action"]),
-        verb=Verb(int(record["verb"])),
-        object=None if row < 0 else row,
-        tool=make_pose(record["position"], record["quaternion"]),
-        joints=np.array(record["joints"]),
-        posture=bool(record["posture"]),
-        by_s=float(record["by"]),
-    )
-
-
 def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
-    """Return the moves of a `TaskCommand` or a `TaskPlan`, oldest first."""
-    return [read_move(record) for record in command.moves[: command.count]]
+    """Return copies of the moves of a `TaskCommand` or a `TaskPlan`, oldest first."""
+    return [
+        Move(
+            id=int(record["id"]),
+            action=int(record["action"]),
+            verb=Verb(int(record["verb"])),
+            object=int(record["object"]) if record["object"] >= 0 else None,
+            tool=make_pose(record["position"], record["quaternion"]),
+            joints=np.array(record["joints"]),
+            posture=bool(record["posture"]),
+            by_s=float(record["by"]),
+        )
+        for record in command.moves[: command.count]
+    ]
 
 
 @dataclass(frozen=True)

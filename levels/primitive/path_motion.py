@@ -158,18 +158,13 @@ class PathMotion:
             change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
             for value, factor in zip(self.set_point, (remaining_part, rate, change), strict=True):
                 value += np.multiply(self._offset, factor, out=self._scratch)
-        if self.time_s >= self.trajectory.duration:
-            self._come_to_rest()
-
-    def _come_to_rest(self) -> None:
-        """End the trajectory, unless an offset from the path remains to be removed."""
-        if self._bridged_s < self._bridging_s:
-            return
-        # Trajectories end with rounding errors, so set the exact end of the path.
-        if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
-            self.s = self.path.length
-            self.set_point.position[:] = self.path.evaluate(self.s).q
-        self._clear_trajectory()
+        # The trajectory does not end while an offset from the path remains to be removed.
+        if self.time_s >= self.trajectory.duration and self._bridged_s >= self._bridging_s:
+            # Trajectories end with rounding errors, so set the exact end of the path.
+            if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
+                self.s = self.path.length
+                position[:] = self.path.evaluate(self.s).q
+            self._clear_trajectory()
 
     def _clear_trajectory(self) -> None:
         """Drop the trajectory, and set velocity and acceleration to zero."""

@@ -76,7 +76,6 @@ class Dynamics:
     """
 
     def __init__(self, cell: Cell) -> None:
-        self._cell = cell
         self._model = copy.copy(cell.model)
         self._model.opt.disableflags |= int(DISABLED_PARTS)
         self._data = d = mujoco.MjData(self._model)
@@ -84,15 +83,15 @@ class Dynamics:
         joints = len(cell.dof)
         # Compiled functions take one array instead of eight, because passing an array costs more
         # than the arithmetic on it.
-        self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
+        evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
         # The first evaluation is without payload, for users to read. The second includes it.
-        self.newest, current = self._evaluations
+        self.newest, current = evaluations
         self.newest[:STATE_ROWS] = np.nan  # not evaluated yet
         self._terms = Terms(current[INERTIA_ROW:], current[BIAS_ROW])
         self._position, self._velocity = current[:STATE_ROWS]
         self._offset = np.zeros(3)
         at = self._model._address, d._address
-        self._evaluating = *at, *find_memory_indices(self._model, d, cell), self._evaluations
+        self._evaluating = *at, *find_memory_indices(self._model, d, cell), evaluations
         hand = int(cell.model.site_bodyid[cell.tool])
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         gravity = np.array(self._model.opt.gravity)

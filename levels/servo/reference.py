@@ -126,8 +126,7 @@ class Reference:
 
     def compute_motion(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, with the acceleration half a tick later."""
-        if self._next is not None and (self.holding or tick >= self._due):
-            self._begin_curve(self._next, tick)
+        self._begin_next_curve(tick)
         offered = self._offered
         waiting = self._next
         if tick < offered != self._due and (waiting is None or offered != waiting.due):
@@ -190,19 +189,17 @@ class Reference:
             self.refused += bool(is_cut.any())
         else:
             self.refused += 1
-        if self._next is not None and (self.holding or tick >= self._due):
-            self._begin_curve(self._next, tick)
+        self._begin_next_curve(tick)
 
-    def _begin_curve(self, set_point: SetPoint, tick: int) -> None:
-        """Begin the curve to a set point.
-
-        Call this only when the previous set point is due, or none is followed.
+    def _begin_next_curve(self, tick: int) -> None:
+        """Begin the curve to the next set point once the previous one is due, or none is followed.
 
         Args:
-            set_point: Set point to reach.
             tick: Present tick.
         """
-        due, position, velocity = set_point
+        if self._next is None or not (self.holding or tick >= self._due):
+            return
+        due, position, velocity = self._next
         self._next = None
         if due <= tick:
             return

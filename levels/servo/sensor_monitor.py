@@ -190,9 +190,7 @@ class SensorMonitor:
         self._end_episode()
         return True
 
-    def check_sample(
-        self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False
-    ) -> None:
+    def check_sample(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool) -> None:
         """Check the sample of a cycle, and add faults to `findings`, once per episode.
 
         Args:

@@ -84,22 +84,17 @@ def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pos
     if len(cell.qpos) < FULL_ORIENTATION:
         yaws = [compute_bearing(cell, seen.position)]
     for tilt in map(math.radians, TILTS_DEG):
+        # The tool points down, tilted towards `yaw`. Its y axis is horizontal.
+        across = math.sin(tilt)
+        leaning = [
+            build_pointing_quaternion(
+                (across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw
+            )
+            for yaw in yaws
+        ]
         for height in heights[::2]:
-            yield [
-                Pose(seen.raise_by(height).position, build_leaning_quaternion(yaw, tilt))
-                for yaw in yaws
-            ]
-
-
-def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
-    """Return the quaternion of a tool that points down, tilted by `tilt`, rad, towards `yaw`.
-
-    The tool's y axis is horizontal.
-    """
-    across = math.sin(tilt)
-    return build_pointing_quaternion(
-        (across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw
-    )
+            position = seen.raise_by(height).position
+            yield [Pose(position, quaternion) for quaternion in leaning]
 
 
 def is_leaning(tool: Pose) -> bool:

@@ -193,11 +193,9 @@ class Detour:
             repeated.
         """
         self.until, self.holds = self._window.find_interruption(plan, done, below)
-        if not self.holds:
-            return done
         # The program can be interrupted once the arm rests and the level below has received the
         # window without further moves.
-        if below.resting and below.operator >= self._orders.basis:
+        if self.holds and below.resting and below.operator >= self._orders.basis:
             self.move = self._window.reserve_id()
             self.holds = False
             return done if is_free_motion(plan, done) else done - 1

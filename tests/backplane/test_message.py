@@ -199,8 +199,8 @@ def test_clear_and_copy_take_every_byte(track: Track) -> None:
 
 
 def test_commands_begin_with_their_serial_and_statuses_with_the_answer() -> None:
-    move = make_message("move", 1, Command, {"goal": field(unit="tick", doc="")})
-    moving = make_message("moving", 1, Status, {"at": field(unit="tick", doc="")})
+    move = make_message("move", Command, {"goal": field(unit="tick", doc="")})
+    moving = make_message("moving", Status, {"at": field(unit="tick", doc="")})
     assert [f.name for f in move.message_type.fields] == ["id", "goal"]
     names = [f.name for f in moving.message_type.fields]
     assert names == ["echo", "state", "error", "reason", "at"]

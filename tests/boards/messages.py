@@ -11,6 +11,7 @@ from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, open_trace_ring
 from rack.backplane.words import Block
+from rack.boards import Rack
 from tests.processes import wait_until
 
 WHAT = ("serial", "tick", "visible_at", "basis", "chain")
@@ -59,3 +60,10 @@ class Written:
             name: [tuple(int(row[word]) for word in WHAT) for row in rows[rows["tick"] < tick]]
             for name, rows in self.messages.items()
         }
+
+
+def run_and_read(rack: Rack, seconds: float) -> Written:
+    """Run a rack, and return what it wrote."""
+    with rack:
+        rack.run(seconds)
+        return Written.on(rack.segment)

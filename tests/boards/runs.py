@@ -36,6 +36,12 @@ def end_of(rack: Rack) -> Outcome:
     return rack.outcome
 
 
+def digest_of(config: RackConfig, seconds: float | None) -> str:
+    """Run a rack and return its digest."""
+    with Rack(config) as rack:
+        return rack.run(seconds).digest
+
+
 def watch_until(rack: Rack, condition: Callable[[], object]) -> None:
     """Watch a running rack until a condition holds, however long the machine takes for it."""
     deadline = time.monotonic() + BOUND_S

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 
 from rack.boards import Rack
-from rack.boards.events import NO_TORQUE, Event
+from rack.boards.events import NO_TORQUE
 from tests.boards.arm_racks import TOGETHER, arm_rack
 from tests.boards.conftest import MakeConfig
 
@@ -22,10 +20,6 @@ def stalling(**params: int) -> str:
     return arm_rack(TOGETHER).replace(
         f'"{RELEASED}"', f'"joint_levels:StallingArm"\nparams = {{ {given} }}'
     )
-
-
-def change(tick: int, code: str, why: str, value: int = 0) -> Event:
-    return Event(time.time_ns(), tick, "reaction", "arm", "", code, subject=why, value=value)
 
 
 @pytest.mark.slow

@@ -36,8 +36,7 @@ def test_a_value_is_shown_as_in_a_config(value: object, text: str) -> None:
 
 @pytest.mark.parametrize("length", [9, 10, 11, 40])
 def test_a_long_text_is_cut_to_its_length(length: int) -> None:
-    text = to_one_line("x" * length, 10)
-    assert text == ("x" * length if length <= 10 else "xxxxxxx...")
+    assert to_one_line("x" * length, 10) == ("x" * length if length <= 10 else "xxxxxxx...")
 
 
 def test_a_mistake_names_place_value_and_reason() -> None:

@@ -45,10 +45,6 @@ class Scene(Message, version=1):
     position: np.ndarray = field(unit="m", doc="of each body", shape=(2, 3))
 
 
-class Order(Message, version=1):
-    id: int = field("u4", unit="1", doc="serial")
-
-
 TICK_MS = CLOCK_NS * 1e-6
 
 

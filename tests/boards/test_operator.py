@@ -20,13 +20,12 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.words import Run, System
 from rack.boards import Rack
-from rack.boards.config import resolve_layout
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
 from rack.boards.operator import copy_request_message
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
+from tests.boards.config.mistakes import find_mistake
 from tests.boards.conftest import MakeConfig
 from tests.boards.runs import faulty
 from tests.boards.runs import kill as kill_at
@@ -146,12 +145,8 @@ def test_a_restarted_board_has_its_live_params_as_they_were_set(
         " set; it takes: hold, resume, goto home",
     }.items(),
 )
-def test_an_impossible_setting_is_refused_in_one_line(
-    commanded: Callable[..., RackConfig], table: str, line: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        resolve_layout(commanded(commands(table)))
-    assert str(caught.value) == line
+def test_an_impossible_setting_is_refused_in_one_line(table: str, line: str) -> None:
+    assert find_mistake(COMMANDED, commands(table)) == line
 
 
 @pytest.mark.slow
@@ -242,10 +237,13 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
     wait_until(lambda: condition() or not rack.watch(0.001) or condition())
 
 
-def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
-        resolve_layout(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
-    with pytest.raises(
-        ConfigError, match="the clock writes it, not a board; must be time-slice or double-buffer"
-    ):
-        resolve_layout(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))
+@pytest.mark.parametrize(
+    ("protocol", "why"),
+    [
+        ("lock", "the clock writes it and must not wait"),
+        ("interrupt", "the clock writes it, not a board; must be time-slice or double-buffer"),
+    ],
+)
+def test_the_clock_takes_no_lock_for_an_operator(protocol: str, why: str) -> None:
+    setting = f"protocol.mailbox={{'upper.operator' = '{protocol}'}}"
+    assert why in find_mistake(COMMANDED, setting)

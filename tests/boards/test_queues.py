@@ -14,9 +14,9 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.config import resolve_layout
-from rack.boards.errors import ConfigError
+from tests.boards.config.mistakes import find_lines, find_mistake
 from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.fault_racks import inline
 from tests.boards.runs import faulty, kill, stop, watch_until
 
 QUEUES = f"""{CLOCK}
@@ -58,12 +58,6 @@ def counts(rack: Rack, board: str) -> dict[str, int]:
     return {
         name: int(status.record[name]) for name in names if status.record[name].dtype.kind != "S"
     }
-
-
-def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str]:
-    with pytest.raises(ConfigError) as caught:
-        resolve_layout(config(*settings, text=text))
-    return str(caught.value).splitlines()
 
 
 @pytest.mark.slow
@@ -192,17 +186,13 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
         (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),
     ],
 )
-def test_invalid_queues_are_refused_in_one_line(
-    config: MakeConfig, settings: tuple[str, ...], expected: str
-) -> None:
-    found = mistakes(config, *settings)
-    assert sum(expected in line for line in found) == 1
+def test_invalid_queues_are_refused_in_one_line(settings: tuple[str, ...], expected: str) -> None:
+    assert sum(expected in line for line in find_lines(QUEUES, *settings)) == 1
 
 
-def test_a_queue_without_a_reader_is_refused(config: MakeConfig) -> None:
-    alone = QUEUES.partition("[board.lower]")[0]
-    (line,) = mistakes(config, text=alone)
-    assert "mailbox upper.requests: no task reads this queue" in line
+def test_a_queue_without_a_reader_is_refused() -> None:
+    found = find_mistake(QUEUES.partition("[board.lower]")[0])
+    assert "mailbox upper.requests: no task reads this queue" in found
 
 
 @pytest.mark.parametrize(
@@ -219,13 +209,5 @@ def test_a_queue_without_a_reader_is_refused(config: MakeConfig) -> None:
         ),
     ],
 )
-def test_faults_that_a_queue_cannot_show_are_refused(
-    config: MakeConfig, fault: dict[str, str], why: str
-) -> None:
-    text = (
-        QUEUES
-        + "[[fault]]\n"
-        + "\n".join(f'{key} = "{value}"' for key, value in ({"board": "upper"} | fault).items())
-    )
-    (line,) = mistakes(config, text=text)
-    assert why in line
+def test_faults_that_a_queue_cannot_show_are_refused(fault: dict[str, str], why: str) -> None:
+    assert why in find_mistake(QUEUES, f"fault=[{inline({'board': 'upper'} | fault)}]")

@@ -12,9 +12,9 @@ from rack.boards import Rack
 from rack.boards.config import build_rack_timing, resolve_layout
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.recovery import RestartPolicy
-from rack.boards.errors import ConfigError
 from rack.boards.timing.command_path import find_command_paths
 from rack.boards.timing.system_response import find_path_mailboxes
+from tests.boards.config.mistakes import find_mistake, find_mistakes
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill
@@ -32,8 +32,7 @@ def jointed(config: MakeConfig) -> MakeConfig:
 def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
     """Run the rack; return its digest and everything that it wrote."""
     with Rack(faulty(config, *faults)) as rack:
-        digest = rack.run(SECONDS).digest
-        return digest, Written.on(rack.segment)
+        return rack.run(SECONDS).digest, Written.on(rack.segment)
 
 
 def at(rows: np.ndarray, tick: int) -> np.void:
@@ -121,12 +120,9 @@ CIRCLES = {
 
 
 @pytest.mark.parametrize(("setting", "place", "circle"), CIRCLES.values(), ids=CIRCLES)
-def test_a_circle_is_one_mistake_with_its_members(
-    jointed: MakeConfig, setting: str, place: str, circle: str
-) -> None:
-    with pytest.raises(ConfigError) as found:
-        resolve_layout(jointed(setting))
-    (mistake,) = [mistake for mistake in found.value.mistakes if "circle" in str(mistake)]
+def test_a_circle_is_one_mistake_with_its_members(setting: str, place: str, circle: str) -> None:
+    found = find_mistakes(JOINTED, setting)
+    (mistake,) = [mistake for mistake in found if "circle" in str(mistake)]
     assert mistake.place == place
     assert str(mistake).endswith(f"the levels form a circle, {circle}")
 
@@ -156,8 +152,5 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("setting", "expected"), WRONG.values(), ids=WRONG)
-def test_a_wrong_list_is_one_mistake(jointed: MakeConfig, setting: str, expected: str) -> None:
-    with pytest.raises(ConfigError) as found:
-        resolve_layout(jointed(setting))
-    (mistake,) = found.value.mistakes
-    assert expected in str(mistake)
+def test_a_wrong_list_is_one_mistake(setting: str, expected: str) -> None:
+    assert expected in find_mistake(JOINTED, setting)

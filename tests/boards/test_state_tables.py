@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError
 from tests.boards.commanded_racks import commands
+from tests.boards.config.mistakes import find_lines
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
 from tests.boards.table_racks import HOLE, SAW, counting
 
 SWAP = 'level = "counter", what = "table", name = "slow", tick = 39'
 SWAP_BACK = 'level = "counter", what = "table", name = "saw", tick = 59'
-RESET = 'level = "counter", what = "do", name = "reset high", tick = 19'
-RESUME = 'level = "counter", what = "resume", tick = 31'
 EDIT = 'fault=[{ kind = "kill", board = "counter", at = 0.1 }]'
 
 
@@ -63,41 +60,36 @@ def test_a_restarted_board_reads_its_file_again_and_continues_in_its_state(
     assert np.abs(np.diff(statuses["count"])).max() == 1
 
 
-def test_a_table_with_a_hole_is_refused_with_its_state_and_case(
-    counter: MakeConfig, tmp_path: Path
-) -> None:
-    given = counter()
-    (tmp_path / "saw.toml").write_text(HOLE)
-    with pytest.raises(ConfigError) as caught:
-        resolve(given)
-    assert (
-        str(caught.value)
-        == "board.counter.params.tables.saw = \"saw.toml\": hole: no row of 'down' takes count ="
-        " low, late = yes, command = none|unknown, new = no\nboard.counter.params.tables.saw ="
-        " \"saw.toml\": hole: no row of 'down' takes count = low, late = yes, command = reset,"
-        " new = no"
-    )
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """The config of the rack as a file beside its tables."""
+    path = tmp_path / "counting.toml"
+    path.write_text(counting(tmp_path))
+    return path
 
 
-def test_unknown_tables_and_commands_are_refused_with_the_known_ones(
-    counter: MakeConfig,
-) -> None:
+def test_a_table_with_a_hole_is_refused_with_its_state_and_case(file: Path) -> None:
+    file.with_name("saw.toml").write_text(HOLE)
+    hole = "hole: no row of 'down' takes count = low, late = yes, command ="
+    assert find_lines(file) == [
+        f'board.counter.params.tables.saw = "saw.toml": {hole} {command}, new = no'
+        for command in ("none|unknown", "reset")
+    ]
+
+
+def test_unknown_tables_and_commands_are_refused_with_the_known_ones(file: Path) -> None:
     given = commands(
         'level = "counter", what = "table", name = "swift", tick = 4',
         'level = "counter", what = "do", name = "reset middle", tick = 4',
         'level = "counter", what = "do", tick = 4',
     )
-    with pytest.raises(ConfigError) as caught:
-        resolve(counter(given))
-    assert str(caught.value).splitlines() == [
+    assert find_lines(file, given) == [
         "command[0].name = \"swift\": table of 'counter' knows: saw, slow",
         "command[1].name = \"reset middle\": do of 'counter' knows: reset low, reset high",
         "command[2].name: do of 'counter' knows: reset low, reset high",
     ]
 
 
-def test_a_missing_file_is_a_mistake_of_the_config(counter: MakeConfig) -> None:
-    with pytest.raises(
-        ConfigError, match=r'params\.tables\.saw = "none\.toml": cannot be read: No such file'
-    ):
-        resolve(counter("board.counter.params.tables.saw=none.toml"))
+def test_a_missing_file_is_a_mistake_of_the_config(file: Path) -> None:
+    found = find_lines(file, "board.counter.params.tables.saw=none.toml")
+    assert 'params.tables.saw = "none.toml": cannot be read: No such file' in found[0]

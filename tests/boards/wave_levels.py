@@ -10,7 +10,6 @@ import os
 import signal
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from rack.backplane.clock.system_clock import SystemClock
@@ -213,16 +212,6 @@ class SlowlyPreloaded(Watch):
     @classmethod
     def preload(cls) -> None:
         os.close(os.open(os.environ["WAVE_MAY_LOAD"], os.O_RDONLY))
-
-
-class Straying(Wave):
-    """A wave that is wrong from tick `at` in the process whose number is in the file `strays`."""
-
-    def process(self, tick: int) -> None:
-        super().process(tick)
-        params = self.context.params
-        if tick >= params["at"] and Path(params["strays"]).read_text() == str(os.getpid()):
-            self.status.value += 1.0
 
 
 class Lottery(Wave):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,3 +46,17 @@ def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess
     finally:
         sys.argv = before
     return subprocess.CompletedProcess(arguments, status, out.getvalue(), err.getvalue())
+
+
+def read_answer(*arguments: object, status: int = 0, folder: Path = ROOT) -> Any:
+    """Run a command with --json, and return its document. Fails on another exit status."""
+    done = rack(*arguments, "--json", folder=folder)
+    assert done.returncode == status, done.stderr
+    return json.loads(done.stdout)
+
+
+def read_refusal(done: subprocess.CompletedProcess[str], status: int = 2) -> str:
+    """Return the line of a refused command. Fails if it prints more or has another exit status."""
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"{line}\n")
+    return line

@@ -72,12 +72,7 @@ def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConf
     return load(str(path), [f"clock.mode={machine.mode}", f"clock.speed={machine.speed}"])
 
 
-def recorded(
-    machine: Machine,
-    others: Sequence[Machine],
-    folder: Path,
-    seed: int = 1,
-) -> Recording:
+def recorded(machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1) -> Recording:
     """Write the recording of a rack that compared its clock with those of others, each time with an
     error.
 

@@ -18,7 +18,6 @@ import pytest
 from rack.tools.cli import COMMANDS
 from rack.tools.console.answer import PIPE_WIDTH
 from tests.processes import RACK
-from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 from tests.tools.held_racks import held_rack
 from tests.warm import Popen
@@ -73,19 +72,13 @@ CUT_OFF = (
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short run of the small rack."""
-    return small_run(tmp_path_factory)
-
-
 @pytest.fixture
 def words_of(
-    small: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> dict[str, str]:
     """What the words of a command line stand for, relative to the folder of the test."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "run").symlink_to(recorded)
+    (tmp_path / "run").symlink_to(run)
     (tmp_path / "rack.toml").write_text(small.read_text())
     for path in small.parent.glob("*.py"):
         (tmp_path / path.name).write_text(path.read_text())
@@ -103,8 +96,14 @@ def find_wide_lines(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_help_is_narrower_than_a_pipe(name: str) -> None:
-    assert find_wide_lines(rack(name, "--help").stdout) == []
+def test_help_is_narrower_than_a_pipe_keeps_its_lines_and_shows_no_escapes(
+    name: str, tmp_path: Path
+) -> None:
+    text = rack(name, "--help", folder=tmp_path).stdout
+    assert find_wide_lines(text) == []
+    assert "\\b" not in text
+    _, _, examples = text.partition("Examples:\n")
+    assert not examples or examples.lstrip().startswith("rack ")
 
 
 @pytest.mark.slow
@@ -228,10 +227,10 @@ def test_a_closed_pipe_causes_no_traceback_while_a_rack_runs(
     ids=["some", "more"],
 )
 def test_a_terminal_of_40_columns_gets_a_narrower_layout_without_colours(
-    lines: Sequence[str], recorded: Path, held: str
+    lines: Sequence[str], run: Path, held: str
 ) -> None:
     for line in lines:
-        shown = show_on_terminal(fill_in(line, {"RUN": str(recorded), "NAME": held}), 40)
+        shown = show_on_terminal(fill_in(line, {"RUN": str(run), "NAME": held}), 40)
         assert not re.findall(r"\x1b\[(?:3|4|9)[0-9]", shown), line
         if line.startswith("check"):
             wide = [each for each in shown.splitlines() if len(each) > 40]

@@ -3,7 +3,6 @@ measured."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_answer
 
 TOGETHER = "path > joint1 ... joint3 > arm"
 
@@ -43,26 +42,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_check_has_one_line_for_boards_with_equal_figures(jointed: Path) -> None:
     done = rack("check", jointed, "--verbose")
     assert done.returncode == 0, done.stdout
-    text = done.stdout
-    assert f"system response, {TOGETHER}:" in text
-    assert [line.split()[:4] for line in text.splitlines() if line.startswith("3.1")] == [
+    lines = done.stdout.splitlines()
+    assert f"system response, {TOGETHER}:" in done.stdout
+    assert [line.split()[:4] for line in lines if line.startswith("3.1")] == [
         ["3.1", "path", "0.7", "<="],
         ["3.1", "joint1", "...", "joint3"],
         ["3.1", "arm", "0.45", "<="],
     ]
-    assert sum(line.startswith("3.3") for line in text.splitlines()) == 1
-    found = json.loads(rack("check", jointed, "--json").stdout)["timing"]
-    assert {v["subject"] for v in found["verdicts"] if v["equation"] == "3.1"} == {
-        "path",
-        *NAMES,
-        "arm",
-    }
+    assert sum(line.startswith("3.3") for line in lines) == 1
+    found = read_answer("check", jointed)["timing"]["verdicts"]
+    subjects = {verdict["subject"] for verdict in found if verdict["equation"] == "3.1"}
+    assert subjects == {"path", *NAMES, "arm"}
 
 
 def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path) -> None:
-    done = rack("check", jointed, "--fix", "--set", "board.joint2.budget.process_ms=2.0", "--json")
-    found = json.loads(done.stdout)
-    assert done.returncode == 0
+    found = read_answer("check", jointed, "--fix", "--set", "board.joint2.budget.process_ms=2.0")
     assert [step[0]["board"] for step in found["steps"]] == ["joint2", "arm"]
 
 

@@ -128,10 +128,8 @@ class Circumstances:
     moving: tuple[str, ...] = ()
 
 
-def judge_faults(
-    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
-) -> FaultVerdict:
-    """Evaluate the faults of a run from its events.
+class Judge:
+    """Evaluates the faults of one run from its events.
 
     Each event counts as the detection of at most one fault. If it fits several, it counts for the
     first to act that has no detection yet. A fault counts as not having acted in two cases: it is a
@@ -143,11 +141,6 @@ def judge_faults(
         events: Events of the run.
         run: Facts about the run.
     """
-    return Judge(strikes, events, run).judge_all()
-
-
-class Judge:
-    """Evaluates the faults of one run."""
 
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
@@ -386,9 +379,8 @@ def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Repo
     events = [*(Event(**event) for event in outcome.get("earlier", ())), *own_events]
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(outcome.get("faults", ()))
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in own_events)
-    verdict = judge_faults(
-        strikes, events, Circumstances(layout, outcome.get("clock_offset_ns", 0), is_lockstep)
-    )
+    run = Circumstances(layout, outcome.get("clock_offset_ns", 0), is_lockstep)
+    verdict = Judge(strikes, events, run).judge_all()
     restarts = Counter(event.board for event in own_events if event.code == "restart")
     return {
         # Faults that never acted come last.

@@ -39,9 +39,9 @@ class LiveRack:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._config = read_stored(self._segment.config)
-        self._levels = PublishedRack.read_from_segment(self._segment).levels
-        self._table = FaultTable(self._segment)
+        self._config = read_stored(segment.config)
+        self._levels = PublishedRack.read_from_segment(segment).levels
+        self._table = FaultTable(segment)
         self._joints = self._config.joints
 
     def inject_fault(

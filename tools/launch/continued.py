@@ -271,7 +271,7 @@ def find_run_config(origin: str) -> Path:
 
 @contextmanager
 def open_beginning(
-    config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
+    config: RackConfig, origin: str, crate: WarmCrate | None, anyway: bool
 ) -> Iterator[Beginning]:
     """Provide a state of a recorded run from which a rack can continue, valid inside the context.
 

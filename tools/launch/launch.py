@@ -119,11 +119,7 @@ class RunResult:
 
         The system response is evaluated later, in the report.
         """
-        return not self.describe_failure()
-
-    def describe_failure(self) -> str:
-        """Return in one line why the run failed. Empty if it did not fail."""
-        return "; ".join(list_failures(self.outcome, self.recording, self.failed))
+        return not list_failures(self.outcome, self.recording, self.failed)
 
 
 def run_rack(

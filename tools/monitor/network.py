@@ -110,9 +110,15 @@ def _find_entries(segment: Segment) -> ExchangedEntries:
 
 def list_peers(newest: NewestMessages) -> tuple[PeerRow, ...]:
     """Return the state of each partner rack that the network adapter has reported."""
-    racks = _find_entries(newest.segment).peers
-    peers = ((rack, newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")) for rack in racks)
-    return tuple(_to_peer_row(rack, message) for rack, message in peers if message is not None)
+    rows = []
+    for rack in _find_entries(newest.segment).peers:
+        peer: Any = newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")
+        if peer is not None:
+            is_known = peer.uncertainty > 0.0
+            clock = (peer.offset * 1e3, peer.uncertainty * 1e3) if is_known else (None, None)
+            state = Presence(peer.presence).name.lower()
+            rows.append(PeerRow(rack, state, peer.since, peer.launches, peer.losses, *clock))
+    return tuple(rows)
 
 
 def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
@@ -154,11 +160,3 @@ def _list_counts(
     if (status := newest.read_message(STATUS)) is not None:
         for port, source in sources.items():
             yield port, source, getattr(status, f"{kind}_{port}")
-
-
-def _to_peer_row(rack: str, message: Any) -> PeerRow:
-    """Convert a message about another rack to a row."""
-    is_known = message.uncertainty > 0.0
-    clock = (message.offset * 1e3, message.uncertainty * 1e3) if is_known else (None, None)
-    state = Presence(message.presence).name.lower()
-    return PeerRow(rack, state, message.since, message.launches, message.losses, *clock)

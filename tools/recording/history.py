@@ -175,7 +175,10 @@ def _list_level_holds(recording: Recording, mailbox: str) -> Iterator[Document]:
     )
     # An operator's command takes precedence over the level's own state.
     hold_codes = np.where(standing_commands > 0, standing_commands, -is_level_holding.astype(int))
-    for first, end in _find_equal_runs(hold_codes):
+    borders = [0, *(np.flatnonzero(np.diff(hold_codes)) + 1).tolist(), len(ticks)]
+    for first, end in pairwise(borders):
+        if first == end or not hold_codes[first]:
+            continue
         is_operators = hold_codes[first] > 0
         why = (
             Operation(hold_codes[first]).name.lower()
@@ -191,13 +194,3 @@ def _list_level_holds(recording: Recording, mailbox: str) -> Iterator[Document]:
             "until_s": round(until * tick_s, 6) if end < len(ticks) else None,
             "lasted_s": round((until - since) * tick_s, 6),
         }
-
-
-def _find_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
-    """Find the runs of equal, consecutive, nonzero numbers in an array.
-
-    Returns:
-        For each run, the index of its first element and the index after its last element.
-    """
-    borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    return [(first, end) for first, end in pairwise(borders) if first < end and numbers[first]]

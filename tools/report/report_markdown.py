@@ -69,7 +69,10 @@ def format_report(document: Document) -> Blocks:
     faults = [{column: fault[column] for column in FAULT_COLUMNS} for fault in report.faults]
     yield from _format_section("Faults", faults)
     yield from _format_section("Detections without a fault", report.unexplained)
-    yield from _format_misses(report)
+    yield from _format_section("Missed and skipped cycles", report.misses)
+    if count_misses(report.misses) != (report.missed, report.skipped):
+        counts = f"The tasks counted {report.missed} and {report.skipped} lost cycles"
+        yield from ("", f"{counts}; the recording does not contain all of them.")
     if response := report.system_response:
         yield from _format_responses([response, *response["others"]])
     network = report.network or {}
@@ -165,14 +168,6 @@ def format_comparison(against: Document) -> Iterator[str]:
         f" {difference['mailbox']}; {why}"
     )
     yield from (f"  - {line}" for line in against["why"])
-
-
-def _format_misses(report: RunReport) -> Blocks:
-    """Yield the section with the first missed cycles, and whether some are not recorded."""
-    yield from _format_section("Missed and skipped cycles", report.misses)
-    if count_misses(report.misses) != (report.missed, report.skipped):
-        counts = f"The tasks counted {report.missed} and {report.skipped} lost cycles"
-        yield from ("", f"{counts}; the recording does not contain all of them.")
 
 
 def _format_responses(chains: Sequence[Document]) -> Blocks:

@@ -61,7 +61,7 @@ def load_report(folder: Path) -> Document:
     return report
 
 
-def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
+def print_report(data: Document, as_json: bool, is_full: bool) -> None:
     """Print a report as JSON, as a summary or as the whole text.
 
     Args:

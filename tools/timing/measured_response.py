@@ -211,9 +211,7 @@ def measure_joined_responses(
         }
 
 
-def find_origins(
-    recording: Recording, path: JoinedPath, refine: Refinement | None = None
-) -> Origins:
+def find_origins(recording: Recording, path: JoinedPath, refine: Refinement | None) -> Origins:
     """Return when the information in the imported messages of a path arrived at its first board.
 
     Args:

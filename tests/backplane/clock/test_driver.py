@@ -206,8 +206,7 @@ def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
     specs = [
         replace(task(f"t{phase}", every=4, slot=2 + phase), phase=phase) for phase in (0, 1, 3)
     ]
-    segment = make_bus(*specs)
-    driver = RealtimeDriver(segment, lambda _: None)
+    driver = RealtimeDriver(make_bus(*specs), lambda _: None)
     last, found = -1, dict[str, list[int]]()
     for tick in (tick for tick in range(24) if tick not in skipped):
         for due in driver.list_due_tasks(tick, last):

@@ -82,8 +82,7 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
     assert ticks == list(range(13))
     words = (System.TICK, System.STOP_TICK, System.STATE)
     assert [segment.words[word] for word in words] == [11, 12, Run.STOPPED]
-    every = {"fast": 1, "slow": 4}
-    for name, period in every.items():
+    for name, period in {"fast": 1, "slow": 4}.items():
         assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(
             range(0, 12, period)
         )
@@ -115,10 +114,8 @@ def test_a_task_that_waits_long_for_its_turn_does_not_begin_before_it(
 ) -> None:
     # Waits end many times within one turn of the other task.
     monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", 0.001)
-    segment = make_bus(task("first", slot=9), task("second", slot=10))
-    log, _ = lockstep(segment, 3, True)
-    names = [name for what, name, _ in log if what == "begin"]
-    assert names == ["first", "second"] * 3
+    log, _ = lockstep(make_bus(task("first", slot=9), task("second", slot=10)), 3, True)
+    assert [name for what, name, _ in log if what == "begin"] == ["first", "second"] * 3
     assert log.index(("end", "first", 1)) < log.index(("begin", "second", 1))
 
 
@@ -310,8 +307,7 @@ def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: Make
         asked.append(block[Block.DONE])
         return tick
 
-    driver = LockstepDriver(segment, ended, False, HISTORY)
-    with in_thread(driver.run):
+    with in_thread(LockstepDriver(segment, ended, False, HISTORY).run):
         block[Block.DONE] = 6
         get_done_semaphore(segment, "fast").release()
     assert asked

@@ -148,11 +148,6 @@ def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
     assert NextCycle(bus, "level").wait() is None
 
 
-def busy() -> None:
-    while True:
-        pass
-
-
 def publish(segment: Segment, tick: int) -> None:
     """Release the task as a clock does that is in time: without a post."""
     segment.get_block("level")[Block.RELEASED] = tick

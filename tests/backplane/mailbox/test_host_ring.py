@@ -57,8 +57,7 @@ def test_messages_come_once_and_in_order(ends: Ends, segment: Segment) -> None:
 
 def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(ends: Ends) -> None:
     writer, reader = ends
-    sent = [send(writer, number) for number in range(1, 9)]
-    assert sent == [True] * CAPACITY + [False] * 3
+    assert [send(writer, number) for number in range(1, 9)] == [True] * CAPACITY + [False] * 3
     assert (reader.full_count, reader.waiting_count) == (3, CAPACITY)
     reader.take_oldest()
     assert send(writer, 9)
@@ -88,8 +87,7 @@ def test_messages_overwritten_by_an_unbounded_writer_are_counted(ends: Ends) -> 
     for number in range(1, 21):
         writer.message.id = number
         writer.write(tick=number)
-    found = taken(reader)
-    assert found == list(range(14, 21))
+    assert taken(reader) == list(range(14, 21))
     assert (reader.superseded, reader.refused) == (13, 0)
 
 

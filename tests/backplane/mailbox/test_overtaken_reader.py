@@ -19,7 +19,7 @@ from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME
-from tests.link import Link, MakeLink, links
+from tests.link import Link, MakeLink
 
 pytestmark = pytest.mark.slow
 
@@ -37,12 +37,6 @@ FAULTS = {
     "reorder": {Alarm.DISORDER, Alarm.HELD_BACK},
 }
 """Kinds of fault, and the alarms that a reader may raise for each."""
-
-
-@pytest.fixture
-def link(rack_name: str) -> Iterator[MakeLink]:
-    with links(rack_name) as make:
-        yield make
 
 
 class Interruption:

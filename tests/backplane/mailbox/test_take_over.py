@@ -153,8 +153,7 @@ def test_a_standby_that_dies_in_its_claim_takes_no_message_from_the_active_copy(
             mine(second, Bomb(number))
             second.take_over()
 
-        is_dead = exit_status(fork(take_over)) != 0
-        assert is_dead == (number < 5)
+        assert (exit_status(fork(take_over)) != 0) == (number < 5)
         # The fifth store follows the claim: then the active copy may not write any more.
         if number < 4:
             write(first, 1, 2)

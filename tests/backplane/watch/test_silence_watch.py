@@ -139,5 +139,4 @@ def test_a_message_that_was_due_in_a_pause_of_the_clock_was_not_suppressed(
 def test_a_pause_does_not_hide_a_writer_that_stays_away(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
-    lost = [rack.reader.cycle(tick).is_lost for tick in range(60, 70)]
-    assert lost == [False] * 4 + [True] * 6
+    assert [rack.reader.cycle(tick).is_lost for tick in range(60, 70)] == [False] * 4 + [True] * 6

@@ -89,8 +89,7 @@ def test_a_lost_message_is_reported_as_a_gap_and_counted_as_trouble(site: Site) 
 
 def test_a_damaged_message_is_reported_and_later_messages_are_read(site: Site) -> None:
     site.send(0, 1, 2, 3)
-    address = message_address(site.segment, 2)
-    site.segment.get_bytes(address, 1)[0] ^= 1
+    site.segment.get_bytes(message_address(site.segment, 2), 1)[0] ^= 1
     assert site.read(1) == [1, 3]
     (alarm,) = site.alarms()
     assert alarm[:2] == (Alarm.DAMAGED, 1)

@@ -12,7 +12,7 @@ import pytest
 
 from rack.boards.config import CONFIGS, list_names, load, load_text
 from rack.boards.config.files import assemble, list_level_classes
-from rack.boards.config.resolved import list_class_names
+from rack.boards.crate.rack import build_preload_request
 from rack.boards.errors import ConfigError
 from tests.boards.config.mistakes import find_lines, find_mistake
 
@@ -24,7 +24,9 @@ def test_every_bundled_config_survives_as_text_and_is_of_the_newest_format(name:
     config = load(name)
     assert load_text(config.to_toml_text()) == config
     assert config.format_notes == []
-    assert list_level_classes(assemble(name, (), None).tables) == list_class_names(config)
+    assert (
+        list_level_classes(assemble(name, (), None).tables) == build_preload_request(config).classes
+    )
 
 
 def test_text_names_a_bundled_model_without_its_folder() -> None:

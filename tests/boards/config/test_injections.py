@@ -10,16 +10,14 @@ import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
 from rack.backplane.layout import Layout
-from rack.boards.config import load_text, resolve_layout
+from rack.boards.config import load_text, resolve, resolve_layout
 from rack.boards.config.injections import find_fault_mistakes
 from rack.boards.config.published import Levels, gather_facts
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind, Parameter
-from tests.boards.config.mistakes import find_mistake
-from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import DRIVEN, LOCKED, TARGETS, rack
+from tests.boards.config.mistakes import find_mistake, find_mistakes, read_config
+from tests.boards.fault_racks import DRIVEN, LOCKED, TARGETS, inline
 
 Fault = dict[str, Any]
 WHEN = {"kind": "kill", "board": "wave"}
@@ -95,26 +93,16 @@ def mistake_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
     return str(mistake)
 
 
-def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
-    with pytest.raises(ConfigError) as error:
-        resolve_layout(rack(config, *faults, settings=settings))
-    return error.value.mistakes
-
-
-def only_mistake(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> str:
-    """Return the one mistake there is, as its line."""
-    (mistake,) = mistakes(config, *faults, settings=settings)
-    return str(mistake)
+def settings_with(*faults: Fault) -> tuple[str, str]:
+    """Return settings of the driven rack: real time, and these faults."""
+    return "clock.mode=realtime", f"fault=[{', '.join(map(inline, faults))}]"
 
 
 @pytest.mark.parametrize(("fault", "line"), MISTAKES)
-def test_a_mistake_is_reported_with_the_permitted_values(
-    config: MakeConfig, fault: Fault, line: str
-) -> None:
-    found = only_mistake(config, fault)
+def test_a_mistake_is_reported_with_the_permitted_values(fault: Fault, line: str) -> None:
+    found = find_mistake(DRIVEN, *settings_with(fault))
     assert line in found
     assert found.startswith("fault[0]")
-    assert "\n" not in found
 
 
 TAKERS = ", ".join(kind.name for kind in KINDS if kind.takes_mailbox)
@@ -175,12 +163,12 @@ def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> No
     assert "self-test strikes as the board starts; remove it" in line
 
 
-def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> None:
+def test_a_lock_is_held_only_where_the_mailbox_has_one() -> None:
     fault = {"kind": "lock-held", "board": "wave", "mailbox": "wave.status"}
     setting = 'protocol.mailbox={ "watch.status" = "lock" }'
-    found = only_mistake(config, fault, settings=(setting,))
+    found = find_mistake(DRIVEN, *settings_with(fault), setting)
     assert "mailboxes of 'wave' that use it: none" in found
-    resolve_layout(rack(config, fault, settings=(LOCKED,)))
+    resolve(read_config(DRIVEN, (*settings_with(fault), LOCKED)))
 
 
 def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
@@ -188,13 +176,13 @@ def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
     assert "joint = 6: out of range; valid: whole numbers -1 to 5; joint, counted from 0" in found
 
 
-def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:
+def test_more_faults_than_a_run_can_have_are_refused() -> None:
     faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
     why = f"too many faults; a run can have at most {FAULT_ENTRIES}"
-    assert only_mistake(config, *faults) == f"fault = {len(faults)}: {why}"
+    assert find_mistake(DRIVEN, *settings_with(*faults)) == f"fault = {len(faults)}: {why}"
 
 
-def test_all_mistakes_of_all_faults_are_reported_at_once(config: MakeConfig) -> None:
+def test_all_mistakes_of_all_faults_are_reported_at_once() -> None:
     faults = (
         {"kind": "kil", "board": "wve", "tick": 1, "at": 1.0},
         {
@@ -207,7 +195,7 @@ def test_all_mistakes_of_all_faults_are_reported_at_once(config: MakeConfig) -> 
             "cycles": 1,
         },
     )
-    places = [mistake.place for mistake in mistakes(config, *faults)]
+    places = [mistake.place for mistake in find_mistakes(DRIVEN, *settings_with(*faults))]
     assert sorted(places) == sorted(
         [f"fault[0].{key}" for key in ("kind", "board", "at")]
         + [f"fault[1].{key}" for key in ("mailbox", "when", "strength", "cycles")]

@@ -71,8 +71,7 @@ def test_an_asynchronous_port_with_interrupts_is_refused() -> None:
 def test_interrupts_are_part_of_computing_and_of_a_plan(small: Path) -> None:
     budget = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0 }"
     config = load(small, [INTERRUPT, budget, *LOOSE])
-    layout = resolve_layout(config)
-    timing = build_rack_timing(config, layout)
+    timing = build_rack_timing(config, resolve_layout(config))
     inbox = timing.inboxes["lower"]
     assert set(inbox.mailboxes) == {"upper.command", "lower.plan"}
     # It is not known when a plan comes, so all messages may come at once.

@@ -24,7 +24,7 @@ FAST, SLOW = "fast", "slow"
 
 
 class Clock:
-    """Time that a test sets."""
+    """Stands for the module `time`: a moment that a test sets."""
 
     def __init__(self) -> None:
         self.now_s = 100.0

@@ -33,7 +33,7 @@ class Site:
 
     def lose(self, status: int, tick: int) -> None:
         """Lose the program's process, and do what is due then."""
-        end = Ended("program", 1, status, 0, tick)
+        end = Ended("program", status, 0, tick)
         self.recovery.record_loss(end, is_over=False, record_printed=lambda: None)
         self.recovery.restart_due_boards()
 
@@ -85,8 +85,7 @@ def test_a_host_board_that_ends_is_restarted_a_limited_number_of_times(
 ) -> None:
     for tick in (10, 20, 30):
         site.lose(-signal.SIGKILL, tick)
-    names = [cast(PowerOn, request).name for request in site.asked]
-    assert names == ["clock", *["program"] * 3]
+    assert [cast(PowerOn, request).name for request in site.asked] == ["clock", *["program"] * 3]
     died = ("died", "host board 'program' ended: signal SIGKILL")
     found = told(journal)
     assert [code for code, _ in found] == ["died", "restart", "died", "restart", "died", "given_up"]

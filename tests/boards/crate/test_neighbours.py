@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from rack.boards.crate.neighbours import find_holders
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_deadlines, needs_fifo, needs_two_cores
-from tests.processes import FORKS, RACK, exit_status, fork, forked, wait_until
+from tests.processes import FORKS, RACK, exit_status, fork, forked, run_to_end, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
@@ -130,9 +129,7 @@ def test_without_real_time_priority_every_view_of_a_rack_says_so(
     path.write_text(config(*FIFO, "clock.on_no_realtime=warn", text=PLAIN).to_toml_text())
     command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", *RACK]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
-    done = subprocess.run(
-        [*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
+    done = run_to_end([*command, *words], BOUND_S, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "SCHED_FIFO refused, ordinary scheduling for wave" in done.stderr
     assert "@GROUP - rtprio 99" in done.stderr

@@ -20,18 +20,9 @@ from rack.boards.crate.patience import (
 from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
 from rack.boards.events import Journal
+from tests.boards.crate.test_heartbeat import Clock
 
 LIMIT_S = 60.0
-
-
-class Clock:
-    """Stands for the module `time`: a moment that the test moves on."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def monotonic(self) -> float:
-        return self.now
 
 
 @pytest.fixture
@@ -51,7 +42,7 @@ def test_a_wait_is_reported_each_time_it_has_doubled(clock: Clock) -> None:
     wait = ReportedWait(journal, LIMIT_S)
     assert wait.left_s == PATIENCE_S
     for passed in (1.9, 2.0, 2.1, 3.9, 4.0, 7.9, 8.1):
-        clock.now = 1000.0 + passed
+        clock.now_s = 100.0 + passed
         wait.report_if_due("loading")
     assert said(journal) == [f"loading, {seconds} s so far" for seconds in (2, 4, 8)]
     assert wait.left_s == pytest.approx(16.0 - 8.1)
@@ -67,10 +58,10 @@ class Line:
         self.output: list[str] = []
 
     def poll(self, timeout_s: float) -> bool:
-        if self._answers and self._answers[0][0] <= self._clock.now - 1000.0 + timeout_s:
-            self._clock.now = max(self._clock.now, 1000.0 + self._answers[0][0])
+        if self._answers and self._answers[0][0] <= self._clock.now_s - 100.0 + timeout_s:
+            self._clock.now_s = max(self._clock.now_s, 100.0 + self._answers[0][0])
             return True
-        self._clock.now += timeout_s + 0.001
+        self._clock.now_s += timeout_s + 0.001
         return False
 
     def receive_message(self) -> object:
@@ -126,13 +117,13 @@ def test_a_wait_for_another_rack_is_reported_each_time_it_has_doubled(
     journal = Journal(None)
     rack = PeerWaitReporter(cast("Segment", None), journal)
     for passed in (0.0, 1.9, 2.1, 4.1):
-        clock.now = 1000.0 + passed
+        clock.now_s = 100.0 + passed
         rack.report_if_due()
     assert said(journal) == [f"'lan' waits for rack 'b', {s} s so far" for s in (2, 4)]
     waits.clear()
     rack.report_if_due()
     waits.append(("lan", "waits for rack 'c'"))
     rack.report_if_due()
-    clock.now += 2.1
+    clock.now_s += 2.1
     rack.report_if_due()
     assert said(journal)[2:] == ["'lan' waits for rack 'c', 2 s so far"]

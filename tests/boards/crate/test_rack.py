@@ -8,8 +8,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -28,6 +26,7 @@ from tests.processes import (
     RACK,
     named,
     parent_of,
+    run_to_end,
     wait_until,
 )
 
@@ -166,10 +165,6 @@ def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     assert maps.read_text().count("(deleted)") < before, name
 
 
-def text_of(events: Sequence[Event], kind: str) -> str:
-    return "\n".join(event.text for event in events if event.kind == kind)
-
-
 @pytest.mark.slow
 @as_root
 @pytest.mark.parametrize(
@@ -211,14 +206,7 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
     path = tmp_path / "limited.toml"
     path.write_text(plain.to_toml_text())
     command = [*(sizes.get(word, word) for word in limits), *RACK, "run", str(path)]
-    done = subprocess.run(
-        [*command, "--seconds", "0.1", "--no-record", "--share"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
+    done = run_to_end([*command, "--seconds", "0.1", "--no-record", "--share"], BOUND_S, cwd=ROOT)
     assert done.returncode == 1
     # Racks of other tests may run beside it: it names them, and what it waits for.
     said = [line for line in done.stderr.splitlines() if not line.startswith("waiting: ")]

@@ -114,8 +114,7 @@ def test_restarts_are_counted_within_their_time_window_only(config: MakeConfig) 
 def test_a_loss_has_the_configured_effect_on_the_arm(
     config: MakeConfig, on_loss: str, demand: list[float]
 ) -> None:
-    settled = config(f"board.wave.on_loss={on_loss}")
-    _, events = run(faulty(settled, kill("wave", 100)))
+    _, events = run(faulty(config(f"board.wave.on_loss={on_loss}"), kill("wave", 100)))
     found = [event for event in events if event.code == "demand"]
     assert [event.value for event in found] == demand
     assert [event.tick for event in found] == [100, 300][: len(demand)]

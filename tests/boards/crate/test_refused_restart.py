@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -16,7 +15,7 @@ from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.boards.crate.test_rack import as_root, as_user
-from tests.processes import FORKS, RACK, exit_status, forked, named, wait_until
+from tests.processes import FORKS, RACK, exit_status, forked, named, run_to_end, wait_until
 from tests.snapshots import ROOT
 
 BOUND_S = 60.0
@@ -36,9 +35,7 @@ def test_a_restart_that_the_system_refuses_is_reported_and_ends_the_run_properly
 
     def run_long() -> None:
         command = [*limits, *RACK, "run", str(path), "--seconds", "60", "--no-record", "--share"]
-        done = subprocess.run(
-            command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
-        )
+        done = run_to_end(command, BOUND_S, cwd=ROOT)
         out.write_text(f"{done.returncode} {done.stderr}")
 
     def occupy() -> None:

@@ -26,7 +26,7 @@ from rack.boards.events import Event, Outcome
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from tests.boards.conftest import LOOSE, PLANNED, MakeConfig
 from tests.boards.remembering_racks import REMEMBERING
-from tests.boards.runs import faulty, kill
+from tests.boards.runs import digest_of, faulty, kill
 from tests.processes import BOUND_S, FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
@@ -91,14 +91,13 @@ def test_a_run_continues_from_each_snapshot_to_the_same_digest(
     config: MakeConfig, crate: WarmCrate, settings: Sequence[str]
 ) -> None:
     rack = config(*settings)
-    with Rack(rack) as plain:
-        expected = plain.run(SECONDS)
+    expected = digest_of(rack, SECONDS)
     ticks = (0, *sorted(random.Random(1).sample(range(1, 400), 3)))
-    assert digests_of_a_chain(rack, crate, *ticks) == {expected.digest}
+    assert digests_of_a_chain(rack, crate, *ticks) == {expected}
     assert ticks_on(crate) == [*ticks]
     for tick in (399, ticks[2], ticks[2]):
         again = continued(rack, crate, tick)
-        assert (again.digest, again.ticks) == (expected.digest, expected.ticks), tick
+        assert (again.digest, again.ticks) == (expected, 400), tick
 
 
 LOST_AT = 150
@@ -130,8 +129,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Digest of the rack without standbys and faults."""
     path = tmp_path_factory.mktemp("plain") / "waves.toml"
     path.write_text(PLANNED)
-    with Rack(load(str(path), [f"name=test-unsnapped-{os.getpid()}"])) as rack:
-        return rack.run(SECONDS).digest
+    return digest_of(load(str(path), [f"name=test-unsnapped-{os.getpid()}"]), SECONDS)
 
 
 @pytest.mark.parametrize("case", STANDBYS)
@@ -191,12 +189,11 @@ def test_a_snapshot_contains_the_whole_state_of_a_level(
     config: MakeConfig, crate: WarmCrate, level: str
 ) -> None:
     rack = config(text=REMEMBERING.replace("Rememberer", level))
-    with Rack(rack) as plain:
-        expected = plain.run(SECONDS)
+    expected = digest_of(rack, SECONDS)
     for at in (210, 300):
         taken(rack, crate, SnapshotPolicy(part=0, at=at))
     for tick in (300, 210):
-        assert continued(rack, crate, tick).digest == expected.digest
+        assert continued(rack, crate, tick).digest == expected
 
 
 def test_a_continued_run_has_snapshots_that_can_be_continued(
@@ -242,11 +239,10 @@ def test_a_branch_differs_after_its_snapshot(config: MakeConfig, crate: WarmCrat
     rack = config(text=REMEMBERING)
     outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=210))
     other = config("board.wave.params.factor=2.0", text=REMEMBERING)
-    struck = faulty(rack, {"kind": "kill", "board": "wave", "tick": 220})
+    struck = faulty(rack, kill("wave", 220))
     branches = [continued(other, crate, 210), continued(struck, crate, 210, known=rack)]
     assert len({outcome.digest, *(branch.digest for branch in branches)}) == 3
-    with Rack(other) as whole:
-        assert whole.run(SECONDS).digest not in (outcome.digest, branches[0].digest)
+    assert digest_of(other, SECONDS) not in (outcome.digest, branches[0].digest)
     # The snapshot itself is as it was.
     assert continued(rack, crate, 210).digest == outcome.digest
 
@@ -256,29 +252,25 @@ def test_a_run_with_faults_restarts_and_skipped_ticks_can_be_continued(
 ) -> None:
     rack = faulty(
         config("supervision.lockstep_restart_s=0.1"),
-        {"kind": "kill", "board": "wave", "tick": 100},
+        kill("wave", 100),
         {"kind": "drop", "board": "wave", "mailbox": "wave.status", "tick": 60, "cycles": 9},
         {"kind": "clock-skip", "board": "clock", "tick": 180},
-        {"kind": "kill", "board": "wave.planner", "tick": 250},
+        kill("wave.planner", 250),
     )
     ticks = (65, 99, 141, 180, 181, 249, 300)
-    with Rack(rack) as plain:
-        expected = plain.run(SECONDS)
-    assert digests_of_a_chain(rack, crate, *ticks) == {expected.digest}
+    expected = digest_of(rack, SECONDS)
+    assert digests_of_a_chain(rack, crate, *ticks) == {expected}
     for tick in (110, 270):
         # None falls into an outage, of 40 ticks.
         taken(rack, crate, SnapshotPolicy(part=0, at=tick))
     assert ticks_on(crate) == [*ticks]
     for tick in (ticks[-1], 65):
-        assert continued(rack, crate, tick).digest == expected.digest, tick
+        assert continued(rack, crate, tick).digest == expected, tick
 
 
 def test_restarts_before_a_snapshot_count_after_it(config: MakeConfig, crate: WarmCrate) -> None:
-    rack = faulty(
-        config("supervision.restarts=1", "supervision.lockstep_restart_s=0.1"),
-        {"kind": "kill", "board": "wave", "tick": 20},
-        {"kind": "kill", "board": "wave", "tick": 100},
-    )
+    settings = ("supervision.restarts=1", "supervision.lockstep_restart_s=0.1")
+    rack = faulty(config(*settings), kill("wave", 20), kill("wave", 100))
     outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=70))
     assert outcome.cause == "board lost"
     again = continued(rack, crate, 70, losses=(("wave", 20),))
@@ -299,10 +291,9 @@ def test_a_level_that_cannot_be_copied_is_named_and_runs_as_before(
 ) -> None:
     settings = (f"board.wave.params.holds={holds}", f"board.wave.params.path={tmp_path / 'log'}")
     rack = config(*settings, text=REMEMBERING.replace("Rememberer", "Uncopied"))
-    with Rack(rack) as plain:
-        expected = plain.run(SECONDS)
+    expected = digest_of(rack, SECONDS)
     outcome, events = taken(rack, crate, SnapshotPolicy(part=1, every=10))
-    assert (outcome.cause, outcome.digest) == ("time over", expected.digest)
+    assert (outcome.cause, outcome.digest) == ("time over", expected)
     # Once: it is not tried again.
     (note,) = [event.text for event in events if event.kind == "ready"]
     assert note.startswith(f"{NO_SNAPSHOTS_PREFIX}wave: {named}")
@@ -351,10 +342,7 @@ def test_a_snapshot_that_has_lost_a_copy_is_dropped(config: MakeConfig, crate: W
 def test_a_continued_board_is_restarted_when_it_is_killed(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
-    rack = faulty(
-        config("supervision.lockstep_restart_s=0.1"),
-        {"kind": "kill", "board": "wave", "tick": 300},
-    )
+    rack = faulty(config("supervision.lockstep_restart_s=0.1"), kill("wave", 300))
     outcome, events = taken(rack, crate, SnapshotPolicy(part=0, at=200))
     with Rack(rack, crate=crate, continues=Continuation(200, faults=1)) as again:
         assert again.run(SECONDS).digest == outcome.digest

@@ -148,8 +148,7 @@ def test_a_restarted_clock_awaits_the_same_messages(site: Site) -> None:
     site.advance(2, 5)
     site.segment.words[System.STATE] = Run.RUNNING
     site.stage = FaultStage(site.segment, site.driver)
-    writer = open_writer(site.segment, NAME)
-    writer.write(5)
+    open_writer(site.segment, NAME).write(5)
     assert site.advance(6, 7) == [(Alarm.FLOWS, 7, 0, 2.0)]
 
 

@@ -16,7 +16,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME
-from tests.link import Link, MakeLink, WritingTask, struck
+from tests.link import Link, MakeLink, WritingTask
 from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -70,7 +70,7 @@ def test_a_fault_is_detected_within_its_bound_and_identified_and_nothing_before_
     found = [tick for tick, code in alarms if code in about.detected_as]
     assert found
     assert bound is not None
-    assert found[0] - struck(entry) <= bound
+    assert found[0] - entry.struck_tick <= bound
     assert {code for _, code in alarms} - set(about.detected_as) <= ALSO.get(kind, set())
     assert len(found) <= 2
 
@@ -227,7 +227,7 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
 
     with forked(write) as pid:
         wait_until(lambda: read_state(pid) in ("Z" if is_killed else "T"))
-        assert (struck(entry), entry.count) == (4, 1)
+        assert (entry.struck_tick, entry.count) == (4, 1)
         reading = rack.reader.cycle(5)
         # The lock of a dead process goes to the waiter; a stopped process keeps it.
         assert reading.verdict is (Verdict.OLD if is_killed else Verdict.BUS_ERROR)

@@ -6,11 +6,10 @@ from typing import Any
 
 import pytest
 
-from rack.boards import Rack
 from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import LOOSE, MakeConfig
 from tests.boards.fault_racks import DRIVEN, FOLLOWED, OF_KINDS, TARGETS
-from tests.boards.runs import faulty
+from tests.boards.runs import digest_of, faulty
 from tests.snapshots import Snapshots
 from tests.whole_runs import in_short, whole_run
 
@@ -52,8 +51,7 @@ def test_a_fault_at_the_first_tick_acts_like_a_later_one(kind: str, config: Make
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
 def test_the_effect_of_each_fault_is_unchanged(kind: Kind, rack: str, config: MakeConfig) -> None:
-    settings = OF_KINDS.get(kind.where, ())
-    struck = faulty(config(*settings, text=RACKS[rack]), *faults(kind))
+    struck = faulty(config(*OF_KINDS.get(kind.where, ()), text=RACKS[rack]), *faults(kind))
     parts = dict(whole_run(struck, SECONDS))
     if kind.name in BY_ORDER:
         del parts["events"]
@@ -70,8 +68,4 @@ def test_a_run_with_a_fault_of_a_planner_repeats(
     lasts = {} if KINDS[kind].once else {"cycles": 80}
     fault = {"kind": kind, "board": "wave.planner", "tick": 101, **lasts}
     struck = faulty(config(*coupling), fault)
-    digests = []
-    for _ in range(2):
-        with Rack(struck) as rack:
-            digests.append(rack.run(1.0).digest)
-    assert digests[0] == digests[1]
+    assert digest_of(struck, 1.0) == digest_of(struck, 1.0)

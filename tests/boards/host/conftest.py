@@ -97,6 +97,12 @@ def make_site(config: MakeConfig) -> Iterator[MakeSite]:
 
 
 @pytest.fixture
+def site(make_site: MakeSite) -> Site:
+    """The site of a test that needs no settings."""
+    return make_site()
+
+
+@pytest.fixture
 def open_bus() -> Iterator[Callable[[Site], HostBus]]:
     with ExitStack() as stack:
 
@@ -109,14 +115,21 @@ def open_bus() -> Iterator[Callable[[Site], HostBus]]:
 
 
 OpenBus = Callable[[Site], HostBus]
+OpenProgram = Callable[[Site], Host]
 
 
 @pytest.fixture
-def open_program(open_bus: OpenBus) -> Callable[[Site], Host]:
+def open_program(open_bus: OpenBus) -> OpenProgram:
     def open_it(site: Site) -> Host:
         return connected(open_bus(site), site)
 
     return open_it
+
+
+@pytest.fixture
+def program(open_program: OpenProgram, site: Site) -> Host:
+    """The program of a test that needs no settings."""
+    return open_program(site)
 
 
 def connected(bus: HostBus, site: Site) -> Host:
@@ -124,6 +137,3 @@ def connected(bus: HostBus, site: Site) -> Host:
     program = Host(site.plan.hosts[0].context)
     bus.connect_ports(program)
     return program
-
-
-OpenProgram = Callable[[Site], Host]

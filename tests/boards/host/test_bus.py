@@ -15,15 +15,14 @@ from rack.boards.host.bus import WORD, HostBus
 from rack.levels.errors import LevelError
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Input
-from tests.boards.host.conftest import MakeSite, OpenBus, OpenProgram
-from tests.boards.host_programs import Sum
+from tests.boards.host.conftest import MakeSite, OpenBus, Site
+from tests.boards.host_programs import Host, Sum
 from tests.processes import BOUND_S, in_thread, wait_until
 
 TICK_S = 0.0025
 
 
-def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBus) -> None:
-    site = make_site()
+def test_an_open_bus_has_claimed_its_board(site: Site, open_bus: OpenBus) -> None:
     site.host[Block.WAITS_UNTIL] = 9
     bus = open_bus(site)
     assert (site.host[Block.STATE], site.host[Block.WAITS_UNTIL]) == (TaskState.RUNNING, 0)
@@ -34,9 +33,8 @@ def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBu
 
 
 def test_no_fault_can_signal_a_program_of_another_pid_namespace(
-    make_site: MakeSite, open_bus: OpenBus
+    site: Site, open_bus: OpenBus
 ) -> None:
-    site = make_site()
     site.segment.words[Head.LAUNCHER_NAMESPACE] += 1
     open_bus(site)
     assert site.host[Block.PID] == 0
@@ -44,11 +42,7 @@ def test_no_fault_can_signal_a_program_of_another_pid_namespace(
         HostBus(site.segment, site.plan.hosts[0])
 
 
-def test_a_message_without_an_id_has_its_number(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    site = make_site()
-    program = open_program(site)
+def test_a_message_without_an_id_has_its_number(site: Site, program: Host) -> None:
     for number, value in ((1, 1.5), (40, 2.5), (3, 3.5)):
         message = program.numbers.message
         assert (message.id, message.value) == (program.numbers.sent + 1, 0.0)
@@ -68,11 +62,7 @@ def test_a_message_without_an_id_has_its_number(
     assert program.numbers.sent == 3
 
 
-def test_a_message_that_cannot_be_sent_is_not_cleared(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    site = make_site()
-    program = open_program(site)
+def test_a_message_that_cannot_be_sent_is_not_cleared(site: Site, program: Host) -> None:
     while program.send_number(1.0):
         pass
     sent = program.numbers.sent
@@ -83,10 +73,7 @@ def test_a_message_that_cannot_be_sent_is_not_cleared(
     assert (program.numbers.sent, program.numbers.message.value) == (sent + 1, 0.0)
 
 
-def test_unknown_fields_and_ports_of_levels_are_named(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    program = open_program(make_site())
+def test_unknown_fields_and_ports_of_levels_are_named(program: Host) -> None:
     with pytest.raises(AttributeError, match="message 'number' has no field 'speed'; fields: id, "):
         program.numbers.message.speed = 1.0  # type: ignore[attr-defined]
     assert program.sum.read().message.state is State.IDLE
@@ -96,8 +83,7 @@ def test_unknown_fields_and_ports_of_levels_are_named(
             sum = Input(Sum, "below.sum")
 
 
-def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bus: OpenBus) -> None:
-    site = make_site()
+def test_the_crates_memory_is_read_by_bus_addresses(site: Site, open_bus: OpenBus) -> None:
     bus = open_bus(site)
     assert bus.tasks == ["bridge", "adder"]
     site.segment.get_block("adder")[Block.CYCLES] = 77
@@ -114,10 +100,7 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
         bus.address("x")
 
 
-def test_a_program_writes_scratch_words_of_its_board_alone(
-    make_site: MakeSite, open_bus: OpenBus
-) -> None:
-    site = make_site()
+def test_a_program_writes_scratch_words_of_its_board_alone(site: Site, open_bus: OpenBus) -> None:
     bus = open_bus(site)
     places = site.segment.map
     for number, value in enumerate((7, -(1 << 63), (1 << 63) - 1)):
@@ -169,8 +152,7 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
     assert not bus.wait(0.02)
     assert time.monotonic() - began >= 0.02
     assert not bus.wait(-1.0)
-    semaphore = get_wake_semaphore(site.segment, "program")
-    with in_thread(semaphore.release):
+    with in_thread(get_wake_semaphore(site.segment, "program").release):
         assert bus.wait(BOUND_S)
     bus.await_turn()
     bus.finish()
@@ -210,10 +192,7 @@ def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
     assert (done.value, site.host[Block.DONE]) == (1, 12)
 
 
-def test_a_program_in_lockstep_runs_only_in_its_turn(
-    make_site: MakeSite, open_bus: OpenBus
-) -> None:
-    site = make_site()
+def test_a_program_in_lockstep_runs_only_in_its_turn(site: Site, open_bus: OpenBus) -> None:
     site.segment.words[System.LOCKSTEP] = 1
     block = site.host
     bus = open_bus(site)

@@ -12,7 +12,8 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.entries import NEVER, EntryConfig, ReplayedEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.bare_level import BareLevel
-from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, connected
+from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, Site, connected
+from tests.boards.host_programs import Host
 
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
 
@@ -22,8 +23,7 @@ def test_each_message_passes_once_and_in_order_up_to_the_limit_of_a_cycle(
 ) -> None:
     site = make_site("board.bridge.params.pass.numbers.most=3")
     program = open_program(site)
-    sent = [program.send_number(float(k)) for k in range(1, 6)]
-    assert sent == [True] * 5
+    assert [program.send_number(float(k)) for k in range(1, 6)] == [True] * 5
     assert program.numbers.sent == 5
     site.cycle()
     assert site.count("numbers") == {"passed": 3, "waiting": 2}
@@ -62,23 +62,15 @@ def test_invalid_values_are_refused_and_counted(
     assert not any(site.crossed())
 
 
-def test_a_full_ring_refuses_messages_and_the_bridge_counts_them(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    site = make_site()
-    program = open_program(site)
+def test_a_full_ring_refuses_messages_and_the_bridge_counts_them(site: Site, program: Host) -> None:
     capacity = site.segment.layout.find_mailbox("program.numbers").capacity
-    answers = [program.numbers.send() for _ in range(capacity + 2)]
-    assert answers == [True] * capacity + [False] * 2
+    assert [program.numbers.send() for _ in range(capacity + 2)] == [True] * capacity + [False] * 2
     site.cycle()
     assert site.count("numbers")["full"] == 2
 
 
-def test_messages_do_not_pass_before_the_computing_time_is_over(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    site = make_site()
-    assert open_program(site).send_number(1.0)
+def test_messages_do_not_pass_before_the_computing_time_is_over(site: Site, program: Host) -> None:
+    assert program.send_number(1.0)
     site.host[Block.DEADLINE] = EVERY
     site.cycle()
     assert site.count("numbers") == {"waiting": 1, "arrived": NEVER, "age": NEVER}
@@ -115,8 +107,7 @@ def test_a_restarted_bridge_continues_its_counters_and_repeats_its_messages(
     }
 
 
-def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: OpenBus) -> None:
-    site = make_site()
+def test_a_message_for_a_program_wakes_it_once(site: Site, open_bus: OpenBus) -> None:
     bus = open_bus(site)
     program = connected(bus, site)
     semaphore = get_wake_semaphore(site.segment, "program")
@@ -150,9 +141,8 @@ STATES = [
 
 @pytest.mark.parametrize(("state", "lost", "expected", "reason"), STATES)
 def test_the_status_of_a_bridge_reports_its_programs(
-    make_site: MakeSite, state: TaskState, lost: int, expected: State, reason: str
+    site: Site, state: TaskState, lost: int, expected: State, reason: str
 ) -> None:
-    site = make_site()
     site.host[Block.STATE] = state
     site.host[Block.LOST] = lost
     site.cycle()

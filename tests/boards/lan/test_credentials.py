@@ -185,5 +185,4 @@ def test_an_authority_may_sign_through_another_but_not_through_a_rack(
     certificates.write_credentials(tmp_path, files)
     assert flaws(tmp_path) == expected
     found = Credentials(tmp_path, "cell")
-    identity = found.identify_sender(found.key_pair.chain)
-    assert (identity is None) == bool(expected)
+    assert (found.identify_sender(found.key_pair.chain) is None) == bool(expected)

@@ -153,8 +153,7 @@ def forged(folder: Path, sealer: Sealer, mixed: KeyPair) -> Iterator[bytes]:
     yield Sealer(below(folder, "puma", "cell", folder / "below")).seal(KEY, HEAD, b"")
     puma._pair = mixed
     yield puma.seal(KEY, HEAD, b"")
-    seal = sealer.seal(KEY, HEAD, b"")
-    yield seal.replace(b"cell", b"puma")
+    yield sealer.seal(KEY, HEAD, b"").replace(b"cell", b"puma")
 
 
 def test_no_rack_makes_the_seal_of_another(folder: Path) -> None:

@@ -132,8 +132,7 @@ def test_a_rack_that_is_started_again_takes_no_part_and_says_why(
         with started(tmp_path / "rack-1.toml", None, STEPPED) as other:
             other.await_event("start")
             rack.segment.words[System.HOLD_AT] = 0
-            outcome = other.outcome()
-            assert outcome["cause"] == "board lost"
+            assert other.outcome()["cause"] == "board lost"
             printed = [event["text"] for event in other.events if event["kind"] == "printed"]
             assert any(f"rack '{names[0]}' " in text for text in printed)
         watch([rack])

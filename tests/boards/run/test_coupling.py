@@ -9,25 +9,20 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import run_and_read
+from tests.boards.run.test_lockstep import SECONDS, TICKS, digest, first_run
 from tests.boards.runs import run_until, stop
 from tests.machine import needs_fifo
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 0.25
-TICKS = 100
 PRIORITIES = ("board.wave.priority=20", "board.watch.priority=19")
 
 
-def digest(rack: Rack) -> str:
-    with rack:
-        return rack.run(SECONDS).digest
-
-
 def test_tight_and_loose_coupling_write_equal_messages_in_lockstep(config: MakeConfig) -> None:
-    assert digest(Rack(config())) == digest(Rack(config(*LOOSE)))
+    tight, loose = (first_run(config, *coupling)[0] for coupling in ((), LOOSE))
+    assert digest(tight) == digest(loose)
 
 
 @pytest.mark.parametrize(("mode", "coupling"), [("lockstep", ()), ("realtime", LOOSE)])
@@ -46,9 +41,7 @@ def test_executor_and_planner_are_two_processes(
 
 
 def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None:
-    with Rack(config()) as rack:
-        rack.run(SECONDS)
-        found = Written.on(rack.segment)
+    _, found = first_run(config)
     plans, wave = found.messages["wave.plan"], found.messages["wave.status"]
     # A plan is wanted in every cycle: the next one begins where a slice ends.
     assert plans["tick"].tolist() == list(range(0, TICKS, 4))
@@ -62,9 +55,8 @@ def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None
 
 @pytest.mark.parametrize("every", [3, 50])
 def test_a_planner_is_asked_again_as_soon_as_it_may_plan(config: MakeConfig, every: int) -> None:
-    with Rack(config(f"board.wave.params.plan_every={every}")) as rack:
-        rack.run(SECONDS)
-        found = Written.on(rack.segment).messages["wave.plan"]["tick"].tolist()
+    rack = Rack(config(f"board.wave.params.plan_every={every}"))
+    found = run_and_read(rack, SECONDS).messages["wave.plan"]["tick"].tolist()
     expected = [0]
     # Asked at every tick that no plan is being made in, four ticks each.
     while (following := next(t for t in range(expected[-1] + 4, 10_000) if t % every == 0)) < TICKS:

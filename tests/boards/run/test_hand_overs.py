@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Mapping
 
 import pytest
 
 from tests.conftest import EXHAUSTIVE
-from tests.processes import BOUND_S
+from tests.processes import BOUND_S, run_to_end
 
 pytestmark = pytest.mark.slow
 ROUNDS = 110_000 if EXHAUSTIVE else 330
@@ -25,13 +24,7 @@ MAX_STALE = 1e-3
 def hand_over(rack: str, rounds: int, cripple: str = "") -> Mapping[str, int]:
     """Return the counts of some rounds of hand-overs, one of whose safeguards is crippled."""
     command = [sys.executable, "-m", "tests.boards.run.hand_overs", rack, str(rounds)]
-    done = subprocess.run(
-        [*command, *filter(None, [cripple])],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_S,
-        check=False,
-    )
+    done = run_to_end([*command, *filter(None, [cripple])], LIMIT_S)
     assert done.returncode == 0, done.stderr
     found: Mapping[str, int] = json.loads(done.stdout)
     return found

@@ -77,8 +77,7 @@ def run(
     faults: tuple[FaultConfig, ...] = (),
     seconds: float = SECONDS,
 ) -> Heard:
-    found = config(*settings, text=RACK).model_copy(update={"fault": faults})
-    with Rack(found) as rack:
+    with Rack(config(*settings, text=RACK).model_copy(update={"fault": faults})) as rack:
         outcome = rack.run(seconds)
         written, block = Written.on(rack.segment), rack.segment.get_block("hub")
         heard = written.messages["hub.status"]["message"]

@@ -12,12 +12,11 @@ from rack.backplane.trace import Flag
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, PLAIN, PLANNED, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import Written, run_and_read
 from tests.machine import needs_two_cores
 
 SECONDS = 0.25
 TICKS = 100
-REALTIME = "clock.mode=realtime"
 SLOW = ("clock.mode=realtime", "clock.speed=0.5")
 """Real time with room: on a machine that does other work too, most cycles are in time."""
 
@@ -26,46 +25,34 @@ OUTLASTING = "board.wave.params={ trouble = 'outlast', at = 40, ticks = 4 }"
 alone it would have had fewer from a late clock."""
 
 
-def written(rack: Rack, seconds: float = SECONDS) -> Written:
-    """Run a rack, and return what it wrote."""
-    with rack:
-        rack.run(seconds)
-        return Written.on(rack.segment)
-
-
-def digest(rack: Rack, seconds: float = SECONDS) -> str:
-    with rack:
-        return rack.run(seconds).digest
-
-
 RUNS: dict[tuple[str, ...], tuple[Rack, Written]] = {}
 
 
 def first_run(
     config: MakeConfig, *settings: str, text: str = PLANNED, seconds: float = SECONDS
 ) -> tuple[Rack, Written]:
-    """Return a rack that has run, and what it wrote; all tests of this file share it."""
+    """Return a rack that has run, and what it wrote; all tests of the process share it."""
     key = (*settings, text)
     if key not in RUNS:
         rack = Rack(config(*settings, text=text))
-        RUNS[key] = rack, written(rack, seconds)
+        RUNS[key] = rack, run_and_read(rack, seconds)
     return RUNS[key]
 
 
-def digest_of(rack: Rack) -> str:
-    """Return the digest of a run that has ended."""
+def digest(rack: Rack) -> str:
+    """Return the digest of a rack, which runs if it has not yet."""
+    if rack.outcome is None:
+        with rack:
+            rack.run(SECONDS)
     assert rack.outcome is not None
     return rack.outcome.digest
 
 
 @pytest.mark.slow
 def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
-    settings = (
-        "board.wave.params.done_at=90",
-        "board.wave.within_cycles=5",
-    )
+    settings = ("board.wave.params.done_at=90", "board.wave.within_cycles=5")
     digests = {digest(Rack(config(one))) for one in settings}
-    assert len(digests | {digest_of(first_run(config)[0])}) == 1 + len(settings)
+    assert len(digests | {digest(first_run(config)[0])}) == 1 + len(settings)
 
 
 @pytest.mark.slow
@@ -73,15 +60,15 @@ def test_the_digest_distinguishes_runs(config: MakeConfig) -> None:
 def test_every_protocol_is_repeatable_in_lockstep(config: MakeConfig, protocol: Protocol) -> None:
     rack = Rack(config(f"protocol.default={protocol}"))
     again = () if protocol == "time-slice" else (f"protocol.default={protocol}",)
-    assert digest(rack) == digest_of(first_run(config, *again)[0])
+    assert digest(rack) == digest(first_run(config, *again)[0])
     assert counted(rack, Block.CORRUPT, Block.BUS_ERRORS, Block.MISSED, Block.SKIPPED) == 0
 
 
 @pytest.mark.slow
 def test_a_single_mailbox_may_have_a_different_protocol(config: MakeConfig) -> None:
     shared = "protocol.mailbox={ 'wave.plan' = 'double-buffer' }"
-    time_slice, mixed = first_run(config)[1], written(Rack(config(shared)))
-    again = written(Rack(config(shared)))
+    time_slice = first_run(config)[1]
+    mixed, again = (run_and_read(Rack(config(shared)), SECONDS) for _ in range(2))
     assert mixed.until(TICKS) == again.until(TICKS)
     assert mixed.messages["wave.plan"]["visible_at"][0] == 0
     assert time_slice.messages["wave.plan"]["visible_at"][0] == 4
@@ -106,12 +93,11 @@ def test_real_time_is_lockstep_up_to_its_first_miss(
     exact, lockstep = first_run(config, *coupling)
     for _ in range(2):
         rack = Rack(config(*SLOW, *coupling))
-        realtime = written(rack)
+        realtime = run_and_read(rack, SECONDS)
         same = realtime.first_miss(TICKS)
         assert realtime.until(same) == lockstep.until(same)
-        assert rack.outcome is not None
         if same == TICKS:
-            assert rack.outcome.digest == digest_of(exact)
+            assert digest(rack) == digest(exact)
             return
         assert (
             rack.segment.words[System.CLOCK_SKIPPED] + counted(rack, Block.MISSED, Block.SKIPPED)
@@ -166,7 +152,7 @@ def test_a_late_cycle_is_counted_and_the_board_rejoins_the_grid(config: MakeConf
 def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     late = "board.wave.params={ trouble = 'late', at = 40, ticks = 20 }"
     rack = Rack(config(*SLOW, *LOOSE, "board.wave.executor=wave_levels:Steady", late))
-    found = written(rack)
+    found = run_and_read(rack, SECONDS)
     plans, cycles = found.messages["wave.plan"], found.cycles["wave.planner"]
     tick = late_tick(found, "wave.planner")
     flags = cycles[cycles["tick"] == tick]["flags"][0]
@@ -181,7 +167,7 @@ def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
 def test_a_slow_cycle_changes_nothing_in_lockstep(config: MakeConfig) -> None:
     quiet, _ = first_run(config, text=PLAIN)
     slow = Rack(config("board.wave.params={ trouble='late', at=40, ticks=9 }", text=PLAIN))
-    assert digest(slow) == digest_of(quiet)
+    assert digest(slow) == digest(quiet)
     assert counted(slow, Block.MISSED, Block.SKIPPED) == 0
 
 

@@ -13,7 +13,7 @@ from rack.boards.config import resolve_layout
 from rack.boards.config.timing import build_rack_timing
 from rack.boards.timing.schedule import simulate_schedule
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import Written, run_and_read
 from tests.boards.runs import faulty, kill, run_until
 
 BOARD = """
@@ -48,17 +48,11 @@ def cyclic(phases: bool = True) -> str:
     return f"{CLOCK}{''.join(boards)}\n[timing]\ncontext_switch_ms = 0.0\n"
 
 
-def written(rack: Rack, seconds: float = 0.25) -> Written:
-    with rack:
-        rack.run(seconds)
-        return Written.on(rack.segment)
-
-
 @pytest.mark.slow
 def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConfig) -> None:
     first, again = Rack(config(text=cyclic())), Rack(config(text=cyclic()))
-    found = written(first)
-    assert found.until(100) == written(again).until(100)
+    found = run_and_read(first, 0.25)
+    assert found.until(100) == run_and_read(again, 0.25).until(100)
     assert first.outcome is not None
     assert again.outcome is not None
     assert first.outcome.digest == again.outcome.digest
@@ -98,8 +92,7 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 @pytest.mark.slow
 def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
-    rack = Rack(faulty(plain, kill("left", 42)))
-    ticks = written(rack, 0.5).cycles["left"]["tick"].tolist()
+    ticks = run_and_read(Rack(faulty(plain, kill("left", 42))), 0.5).cycles["left"]["tick"].tolist()
     every, phase, _ = MINOR["left"]
     assert ticks[0] == phase
     assert {tick % every for tick in ticks} == {phase}

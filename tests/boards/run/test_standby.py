@@ -20,9 +20,8 @@ from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, PLANNED, UNJUDGED, MakeConfig
-from tests.boards.runs import end_of, faulty, kill
+from tests.boards.runs import digest_of, end_of, faulty, kill
 from tests.processes import wait_until
 from tests.tools.command_line import rack
 
@@ -31,8 +30,6 @@ TWO = "board.wave.standby=[{slot=9,core=0},{slot=10,core=1}]"
 SOON = "supervision.lockstep_restart_s=0.05"
 MANY = "supervision.restarts=1000"
 SECONDS = 0.5
-STRAYS_AT = 420
-LONG_S = 1.25
 AFTER = 3
 """Ticks after a hand-over in which messages are counted."""
 MISSING = 1
@@ -48,18 +45,13 @@ def overload(board: str, tick: int) -> dict[str, Any]:
     return {"kind": "overrun", "board": board, "tick": tick, "cycles": 3, "by": 1.5}
 
 
-def run(config: RackConfig, seconds: float = SECONDS) -> tuple[str, ReplicatedTask, list[str]]:
+def run(config: RackConfig) -> tuple[str, ReplicatedTask, list[str]]:
     """Run a rack in lockstep. Returns its digest, its replicated task, and its alarms' codes."""
     with Rack(config) as rack:
-        outcome = rack.run(seconds)
+        outcome = rack.run(SECONDS)
         (task,) = list_standbys(rack.segment)
         found = [event.code for event in rack.events if event.kind == "detection"]
     return outcome.digest, task, found
-
-
-def digest_of(config: RackConfig, seconds: float = SECONDS) -> str:
-    with Rack(config) as rack:
-        return rack.run(seconds).digest
 
 
 def read_ticks(segment: Segment, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -97,7 +89,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Digest of the rack without standbys and faults."""
     path = tmp_path_factory.mktemp("plain") / "waves.toml"
     path.write_text(PLANNED)
-    return digest_of(load(str(path), [f"name=test-plain-{os.getpid()}"]))
+    return digest_of(load(str(path), [f"name=test-plain-{os.getpid()}"]), SECONDS)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -105,8 +97,7 @@ def test_in_lockstep_nobody_can_tell_which_copy_has_written(
     case: str, config: MakeConfig, plain: str
 ) -> None:
     standby, faults, active, reason, count = CASES[case]
-    struck = faulty(config(standby, SOON, UNJUDGED, text=PLANNED), *faults)
-    digest, task, alarms = run(struck)
+    digest, task, alarms = run(faulty(config(standby, SOON, UNJUDGED, text=PLANNED), *faults))
     assert (task.active.name, task.reason, task.hand_overs) == (active, reason, count)
     assert digest == plain
     assert set(alarms) <= {"hang", "late"}
@@ -229,56 +220,6 @@ def test_in_real_time_the_standby_of_the_clock_continues_its_grid(config: MakeCo
     assert np.diff(around).max() <= 1 + 2
 
 
-def run_straying(
-    config: MakeConfig, file: Path, copy: str, *settings: str
-) -> tuple[ReplicatedTask, list[Event]]:
-    """Run a rack in which one copy computes wrong messages from `STRAYS_AT` on."""
-    text = PLAIN.replace("wave_levels:Wave", "wave_levels:Straying")
-    params = f'board.wave.params={{at={STRAYS_AT},strays="{file}"}}'
-    with Rack(config(params, SOON, UNJUDGED, *settings, text=text)) as rack:
-        file.write_text(str(rack.segment.get_block(copy)[Block.PID]))
-        rack.run(LONG_S)
-        (task,) = list_standbys(rack.segment)
-        return task, list(rack.events)
-
-
-@pytest.mark.parametrize("copy", ["wave", "wave.standby"])
-def test_copies_that_differ_are_noticed_one_cycle_later(
-    config: MakeConfig, tmp_path: Path, copy: str
-) -> None:
-    file = tmp_path / "pid"
-    task, events = run_straying(config, file, copy, STANDBY, "board.wave.compare=true")
-    (found,) = (event for event in events if event.code == "differs")
-    assert (found.tick, found.subject, found.board) == (
-        STRAYS_AT + 1,
-        "wave.status",
-        "wave.standby",
-    )
-    assert found.text == "'wave.status': a standby computes another value"
-    assert task.hand_overs == 0
-
-
-@pytest.mark.parametrize(
-    ("copy", "active", "reason"),
-    [
-        ("wave", "wave.standby", "strayed"),
-        ("wave.standby", "wave", "none"),
-        ("wave.standby2", "wave", "none"),
-    ],
-)
-def test_the_copy_that_two_others_outvote_is_taken_out_and_restarted(
-    config: MakeConfig, tmp_path: Path, copy: str, active: str, reason: str
-) -> None:
-    task, events = run_straying(config, tmp_path / "pid", copy, TWO, "board.wave.vote=true")
-    (found,) = (event for event in events if event.code == "strayed")
-    assert (found.tick, found.subject) == (STRAYS_AT + 2, copy)
-    assert (task.active.name, task.reason) == (active, reason)
-    (died,) = (event for event in events if event.code == "died")
-    (rejoined,) = (event for event in events if event.code == "rejoined")
-    assert (died.board, rejoined.board) == (copy, copy)
-    assert all(one.aligned_since is not None for one in task.copies if not one.is_active)
-
-
 def test_a_level_that_is_not_deterministic_cannot_be_compared(
     config: MakeConfig, tmp_path: Path
 ) -> None:
@@ -304,8 +245,7 @@ def test_an_operator_switches_without_a_gap(config: MakeConfig, plain: str) -> N
 
 def test_a_switch_while_no_standby_is_ready_is_reported(config: MakeConfig) -> None:
     commands = 'command=[{level="wave",what="switch",tick=35}]'
-    struck = faulty(config(STANDBY, commands, text=PLANNED), kill("wave.standby", 30))
-    with Rack(struck) as rack:
+    with Rack(faulty(config(STANDBY, commands, text=PLANNED), kill("wave.standby", 30))) as rack:
         rack.run(SECONDS)
         assert list_standbys(rack.segment)[0].hand_overs == 0
         (event,) = [event for event in rack.events if event.code == "not_switched"]

@@ -31,9 +31,6 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until
 from tests.tools.faults.test_ending import box
 
-RESTART_TICKS = 200
-"""Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
-
 
 def wiring(**changed: object) -> ClockWiring:
     """Return a clock's wiring in real time, without a stop."""
@@ -238,28 +235,22 @@ def ends_at(
     return found
 
 
-@pytest.mark.parametrize("state", [State.DONE, State.ERROR])
-def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State) -> None:
-    found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), state, 5, 12)
+ENDS: dict[str, tuple[State, dict[str, int], list[int | None]]] = {
     # Visible at 6, seen at 7 as of the tick before; ten ticks of rest.
-    assert found == [None] * 7 + [16] * 5
-
-
-def test_a_run_with_an_unfinished_task_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:
-    found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), State.EXECUTING, 5, 60)
+    "lingers after its task is done": (State.DONE, {}, [None] * 7 + [16] * 5),
+    "lingers after its task has failed": (State.ERROR, {}, [None] * 7 + [16] * 5),
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
-    assert found == [None] * 47 + [56] * 13
-
-
-def test_a_run_whose_task_never_ends_is_ended_by_its_longest_time(make_bus: MakeBus) -> None:
-    segment = make_bus(box(TaskStatus, "task.status"), task("task"))
-    found = ends_at(segment, State.EXECUTING, 5, 35, longest=20)
+    "ends once the level is silent": (State.EXECUTING, {}, [None] * 47 + [56] * 13),
     # Noticed at tick 20, which reads as of the tick before; ten ticks of rest.
-    assert found == [None] * 20 + [29] * 15
+    "ends after its longest time": (State.EXECUTING, {"longest": 20}, [None] * 20 + [29] * 15),
+    "ends at its given length": (State.DONE, {"stop_tick": 99}, [99] * 12),
+}
+"""What a run does: the state that its task writes, settings, and the end as known at each tick."""
 
 
-def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:
-    found = ends_at(
-        make_bus(box(TaskStatus, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99
-    )
-    assert found == [99] * 12
+@pytest.mark.parametrize(("state", "settings", "ends"), ENDS.values(), ids=ENDS)
+def test_a_run_ends_by_its_length_its_task_its_silence_or_its_longest_time(
+    make_bus: MakeBus, state: State, settings: dict[str, int], ends: list[int | None]
+) -> None:
+    segment = make_bus(box(TaskStatus, "task.status"), task("task"))
+    assert ends_at(segment, state, 5, len(ends), **settings) == ends

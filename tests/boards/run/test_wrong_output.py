@@ -62,15 +62,17 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 
 @pytest.mark.parametrize("copy", ["wave", "wave.standby"])
 @pytest.mark.parametrize(
-    ("fault", "field", "text"),
+    ("fault", "text"),
     [
-        ({"field": 4, "bit": 3}, "value", "wave.status.value, bit 3"),
-        ({"field": 4, "offset": 0.25}, "value", "wave.status.value, offset 0.25 1"),
+        ({"field": 4, "bit": 3}, "wave.status.value, bit 3"),
+        ({"field": 4, "offset": 0.25}, "wave.status.value, offset 0.25 1"),
+        # Until the end: one difference, and no standby with the state of the active copy.
+        ({"field": 4, "offset": 1.0, "cycles": 1000}, "wave.status.value, offset 1 1"),
     ],
-    ids=["bit", "offset"],
+    ids=["bit", "offset", "lasting"],
 )
 def test_a_wrong_output_is_named_one_cycle_later(
-    config: MakeConfig, plain: Ran, copy: str, fault: dict[str, Any], field: str, text: str
+    config: MakeConfig, plain: Ran, copy: str, fault: dict[str, Any], text: str
 ) -> None:
     ran = Ran(faulty(config(STANDBY, COMPARE, SOON, UNJUDGED), wrong(copy, **fault)))
     assert ran.text == [f"wrong-output of {copy} ({text})"]
@@ -80,23 +82,31 @@ def test_a_wrong_output_is_named_one_cycle_later(
         "wave.status",
         "wave.standby",
     )
+    assert found.text == "'wave.status': a standby computes another value"
     assert ran.tasks[0].hand_overs == 0
     assert (ran.digest == plain.digest) == (copy != "wave")
-    assert all(one.aligned_since is not None for one in ran.tasks[0].copies if not one.is_active)
+    (standby,) = (one for one in ran.tasks[0].copies if not one.is_active)
+    assert (standby.aligned_since is None) == ("cycles" in fault)
 
 
 @pytest.mark.parametrize(
-    ("copy", "active"),
-    [("wave", "wave.standby"), ("wave.standby", "wave"), ("wave.standby2", "wave")],
+    ("copy", "active", "reason"),
+    [
+        ("wave", "wave.standby", "strayed"),
+        ("wave.standby", "wave", "none"),
+        ("wave.standby2", "wave", "none"),
+    ],
 )
 def test_a_vote_takes_the_copy_with_a_wrong_output_out_and_nothing_else_changes(
-    config: MakeConfig, plain: Ran, copy: str, active: str
+    config: MakeConfig, plain: Ran, copy: str, active: str, reason: str
 ) -> None:
     ran = Ran(faulty(config(TWO, VOTE, SOON, UNJUDGED), wrong(copy, field=4, bit=3)))
     (found,) = ran.find("strayed")
     assert (found.tick, found.subject) == (WRONG_AT + 2, copy)
-    assert [event.board for event in ran.find("rejoined")] == [copy]
-    assert ran.tasks[0].active.name == active
+    assert [event.board for event in ran.find("died") + ran.find("rejoined")] == [copy, copy]
+    (task,) = ran.tasks
+    assert (task.active.name, task.reason) == (active, reason)
+    assert all(one.aligned_since is not None for one in task.copies if not one.is_active)
     assert (ran.digest == plain.digest) == (copy != "wave")
     wrong_ticks = [
         tick

@@ -35,7 +35,7 @@ class Load(NamedTuple):
     def release(self, now: int, scheduler: Scheduler) -> CoreJob:
         due = now + self.period
         order = scheduler, self.priority, self.is_critical
-        return CoreJob(self.name, now, *order, now, due, self.cost)
+        return CoreJob(self.name, *order, now, due, self.cost)
 
 
 def run(
@@ -51,7 +51,7 @@ def run(
             if now % load.period == 0
         ]
         while (job := core.run_until(now + 1)) is not None:
-            ends[job.task, job.release] = core.now_ns
+            ends[job.task, job.ready_at] = core.now_ns
     return ends
 
 
@@ -87,8 +87,7 @@ def test_fixed_priorities_give_the_schedule_of_the_gantt_chart(seed: int) -> Non
     # Up to this share rate-monotonic priorities meet all deadlines (Liu and Layland).
     loads = list(draw(random.Random(seed), 0.69))
     until = lcm(*(load.period for load in loads))
-    tasks = build_tasks(loads)
-    chart = simulate_schedule(tasks, until)
+    chart = simulate_schedule(build_tasks(loads), until)
     expected = {(job.task, job.release_ns): job.end_ns for job in chart.jobs}
     assert run(loads, FIXED, until) == expected
 
@@ -142,7 +141,7 @@ def test_on_one_core_urgency_precedes_deadlines_and_these_precede_priorities(
     core = SimulatedCore()
     # Whatever the deadlines and priorities are.
     core.jobs = [
-        CoreJob(scheduler.word, 0, scheduler, 10 * at, False, 0, 100 - at, 5)
+        CoreJob(scheduler.word, scheduler, 10 * at, False, 0, 100 - at, 5)
         for at, scheduler in enumerate(order)
     ]
     ended = [core.run_until(100) for _ in order]
@@ -155,8 +154,8 @@ def test_on_one_core_urgency_precedes_deadlines_and_these_precede_priorities(
 def test_a_change_of_the_scheduler_acts_on_a_job_that_has_begun() -> None:
     core = SimulatedCore()
     core.jobs = [
-        CoreJob("first", 0, FIXED, 9, False, 0, 50, 20),
-        CoreJob("second", 0, FIXED, 1, False, 0, 40, 20),
+        CoreJob("first", FIXED, 9, False, 0, 50, 20),
+        CoreJob("second", FIXED, 1, False, 0, 40, 20),
     ]
     assert core.run_until(10) is None
     core.jobs[1].scheduler = URGENCY

@@ -62,8 +62,7 @@ def drive_cycles(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> 
         state = arm.drives if hasattr(arm, "drives") else arm
         q, qd = ("position", "velocity") if hasattr(arm, "drives") else ("_q", "_qd")
         true.append((getattr(state, q).copy(), getattr(state, qd).copy()))
-    positions, velocities = (np.array(rows) for rows in zip(*true, strict=True))
-    return positions, velocities
+    return np.array([q for q, _ in true]), np.array([qd for _, qd in true])
 
 
 def compute_excess(cell: Cell, motion: tuple[Array, Array]) -> tuple[float, float]:

@@ -54,12 +54,17 @@ class IdealArm(Arm):
         for _ in range(ticks):
             if self.waited >= self.patience:
                 self.brake()
-            for _ in range(0 if self.braked else SUBSTEPS):
+            for step in range(0 if self.braked else SUBSTEPS):
+                torque = self.compute_torque(step)
                 inertia, bias = self._dynamics.terms(self._q, self._qd)
-                self._qd += self._step_s * solve(inertia, self.torque - bias)
+                self._qd += self._step_s * solve(inertia, torque - bias)
                 self._q += self._step_s * self._qd
             self.waited += 1
             self.tick += 1
+
+    def compute_torque(self, step: int) -> Array:
+        """Return the torque of the motors in a substep of a tick, (joints,), N m."""
+        return self.torque
 
     def save(self, state: Message) -> None:
         super().save(state)

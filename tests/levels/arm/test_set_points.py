@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array, solve
+from rack.levels.algebra import Array
 from rack.levels.arm import Arm, JointTarget, SimulatedArm
 from rack.levels.arm import simulated as simulated_arm
 from rack.levels.arm.guard import GuardedArm
@@ -19,6 +19,7 @@ from rack.levels.arm.simulated import CascadedDrives
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import Interface, SceneConfig
+from tests.levels.arm.test_guard import compute_excess
 from tests.levels.arm.test_own_arm import SUBSTEPS, IdealArm
 from tests.levels.arms import CLOCK_NS, config, pendulum, save_state
 
@@ -58,18 +59,9 @@ class ServoArm(IdealArm):
         self.waited, self.braked = 0, False
         return None
 
-    def step(self, ticks: int) -> None:
-        for _ in range(ticks):
-            if self.waited >= self.patience:
-                self.brake()
-            for step in range(0 if self.braked else SUBSTEPS):
-                now = SUBSTEPS * self.waited + step
-                torque = self._servos.compute_torque(self._q, self._qd, now)
-                inertia, bias = self._dynamics.terms(self._q, self._qd)
-                self._qd += self._step_s * solve(inertia, torque - bias)
-                self._q += self._step_s * self._qd
-            self.waited += 1
-            self.tick += 1
+    def compute_torque(self, step: int) -> Array:
+        now = SUBSTEPS * self.waited + step
+        return self._servos.compute_torque(self._q, self._qd, now)
 
 
 def build_simulated(name: str, interface: Interface) -> tuple[SimulatedArm, Cell]:
@@ -143,16 +135,13 @@ def test_no_set_points_exceed_limits_of_a_guarded_arm_that_misses_cycles(
     def beyond(is_guarded: bool) -> float:
         arm, guard = build_guarded(tmp_path, interface)
         random = np.random.default_rng(1)
-        low, high = arm.cell.bounds.position.T
         worst = -np.inf
         for target in draw_hostile_targets(arm.cell, kind, 400):
             guard.sense()
             assert (guard if is_guarded else arm).follow(target, 0.0) is None or not is_guarded
             for _ in range(random.integers(1, arm.patience, endpoint=True)):
                 arm.step(1)
-                far = np.maximum(low - arm._q, arm._q - high)
-                fast = np.abs(arm._qd) - arm.cell.bounds.velocity
-                worst = max(worst, float(far.max()), float(fast.max()))
+                worst = max(worst, *compute_excess(arm.cell, (arm._q[None], arm._qd[None])))
         assert arm.violations == 0 or not is_guarded
         return worst
 

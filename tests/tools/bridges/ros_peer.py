@@ -88,8 +88,7 @@ def main() -> None:
             case "move":
                 points = [
                     JointTrajectoryPoint(
-                        positions=positions,
-                        time_from_start=Duration(int(at), int(at % 1 * 1e9)),
+                        positions=positions, time_from_start=Duration(int(at), int(at % 1 * 1e9))
                     )
                     for at, positions in request["points"]
                 ]

@@ -109,10 +109,7 @@ def test_a_service_call_stops_the_arm(arm: HeldRack, peer: Peer) -> None:
     assert response["success"]
     assert lines.emergency_stop
     # The reply carries the number and the GID of the request.
-    assert (attachment[:16], attachment[32:]) == (
-        "0700000000000000",
-        "10" + bytes(range(16)).hex(),
-    )
+    assert (attachment[:16], attachment[32:]) == ("0700000000000000", "10" + bytes(range(16)).hex())
     arm.wait_for("/rack/emergency_stop: the emergency stop is set")
 
 

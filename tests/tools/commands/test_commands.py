@@ -15,10 +15,9 @@ import pytest
 
 from rack.backplane.segment import list_racks
 from rack.boards import Rack
-from rack.boards.config import load
+from rack.boards.config import RackConfig
 from rack.tools.console.interrupt import list_descendants
 from tests.processes import RACK, is_ticking, runs, wait_until
-from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 from tests.warm import Popen, run_command
 
@@ -77,16 +76,15 @@ def imported(*arguments: object) -> set[str]:
 
 @pytest.mark.slow
 def test_a_command_starts_without_libraries_that_it_does_not_need(
-    small: Path, rack_name: str, tmp_path_factory: pytest.TempPathFactory
+    config: RackConfig, run: Path
 ) -> None:
     parser = {"typer", "pydantic"}
     assert imported("run", "--help") <= parser
     assert imported("list") <= parser
-    with Rack(load(small, [f"name={rack_name}"])):
-        assert imported("status", rack_name, "--json") <= {"numpy", *parser}
-    folder = small_run(tmp_path_factory)
-    rack("report", folder)
-    assert imported("report", folder) <= parser
+    with Rack(config):
+        assert imported("status", config.name, "--json") <= {"numpy", *parser}
+    rack("report", run)
+    assert imported("report", run) <= parser
 
 
 @pytest.mark.slow

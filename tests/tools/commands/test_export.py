@@ -11,19 +11,13 @@ from mcap.reader import make_reader
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
 from rack.boards.config import load
-from tests.shared_runs import small_run
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_refusal
 from tests.tools.recordings import recorded
 
 pytestmark = pytest.mark.slow
 
 FILES = {"mcap": "run.mcap", "rosbag2": "run-rosbag2", "perfetto": "run.pftrace"}
 """Default name of each kind."""
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_run(tmp_path_factory)
 
 
 def export(run: Path, kind: str) -> int:
@@ -60,9 +54,8 @@ def test_files_are_written_whole_and_counted(run: Path) -> None:
 def test_an_existing_file_is_kept(run: Path, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "kept"
     path.write_text("kept")
-    done = rack("export", run, "--to", kind, "--out", path)
-    wanted = f"{path}: exists already; remove it, or give another --out\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", wanted)
+    wanted = f"{path}: exists already; remove it, or give another --out"
+    assert read_refusal(rack("export", run, "--to", kind, "--out", path)) == wanted
     assert path.read_text() == "kept"
 
 
@@ -70,17 +63,18 @@ def test_a_refused_export_is_reported_in_one_line(run: Path, small: Path, tmp_pa
     out = tmp_path / "out"
     out.mkdir()
     empty = recorded(tmp_path / "empty", load(small, []), {}).folder
+    nothing = f"{empty}: no message is recorded, so a bag would be empty"
     for words, why in (
         ((out,), f"{out}: not a run: it has no config.toml"),
         ((run, "--out", "/dev/full/x"), '"/dev/full/x.part": Not a directory'),
-        ((empty, "--out", out / "x"), f"{empty}: no message is recorded, so a bag would be empty"),
+        ((empty, "--out", out / "x"), nothing),
+        ((empty, "--to", "rosbag2", "--out", out / "x"), nothing),
         (
             (empty, "--to", "perfetto", "--out", out / "x"),
             f"{empty}: no cycle is recorded, so the trace would be empty",
         ),
     ):
-        done = rack("export", *words)
-        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{why}\n")
+        assert read_refusal(rack("export", *words)) == why
     assert [*out.iterdir()] == []
 
 
@@ -98,18 +92,12 @@ def test_an_unknown_kind_is_refused_with_the_known_ones(run: Path) -> None:
     [("mcap", "rosbags", "export"), ("rosbag2", "rosbags", "export"), ("perfetto",) * 3],
 )
 def test_a_missing_package_is_named_with_the_line_that_installs_it(
-    run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    kind: str,
-    package: str,
-    extra: str,
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, package: str, extra: str
 ) -> None:
     for name in list(sys.modules):
         if name.startswith(("rack.tools.ecosystem", f"{package}.")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    done = rack("export", run, "--to", kind, "--out", tmp_path / "x")
-    wanted = f"--to {kind} needs {package}: pip install 'nasrem-rack[{extra}]'\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", wanted)
+    refusal = read_refusal(rack("export", run, "--to", kind, "--out", tmp_path / "x"))
+    assert refusal == f"--to {kind} needs {package}: pip install 'nasrem-rack[{extra}]'"
     assert [*tmp_path.iterdir()] == []

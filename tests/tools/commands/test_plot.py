@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import load
+from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
 from rack.tools.recording.checksums import format_checked_line
 from tests.processes import wait_until
 from tests.shared_runs import slow_run, small_run
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_refusal
 from tests.tools.held_racks import held_rack
 from tests.tools.recordings import cycle, recorded
 
@@ -131,26 +131,19 @@ def test_a_picture_is_saved_by_its_suffix(run: Path, tmp_path: Path, suffix: str
 def test_bad_arguments_are_refused_in_one_line(
     run: Path, tmp_path: Path, words: tuple[str, ...], message: str
 ) -> None:
-    shown = rack("plot", run, *words, folder=tmp_path)
-    assert (shown.returncode, shown.stdout) == (2, "")
-    assert shown.stderr.startswith(message)
-    assert len(shown.stderr.splitlines()) == 1
+    assert read_refusal(rack("plot", run, *words, folder=tmp_path)).startswith(message)
     assert [*tmp_path.iterdir()] == []
 
 
 def test_a_condition_that_never_holds_is_named(run: Path) -> None:
-    shown = rack("plot", run, COUNT, "--when", f"{COUNT} < 0")
-    assert (shown.returncode, shown.stderr) == (1, f"{COUNT} < 0: does not hold from 0 to 4 s\n")
+    refusal = read_refusal(rack("plot", run, COUNT, "--when", f"{COUNT} < 0"), status=1)
+    assert refusal == f"{COUNT} < 0: does not hold from 0 to 4 s"
 
 
 def test_a_signal_without_messages_is_named(tmp_path: Path) -> None:
-    config = load("fig2")
-    recorded(tmp_path / "run", config, {"level": [cycle(0, 2000, 0, 0, 1, 3, 4)]})
-    shown = rack("plot", tmp_path / "run", "level.status.state")
-    assert (shown.returncode, shown.stderr) == (
-        2,
-        "level.status.state: no message of level.status is recorded\n",
-    )
+    recorded(tmp_path / "run", load("fig2"), {"level": [cycle(0, 2000, 0, 0, 1, 3, 4)]})
+    refusal = read_refusal(rack("plot", tmp_path / "run", "level.status.state"))
+    assert refusal == "level.status.state: no message of level.status is recorded"
 
 
 @pytest.mark.parametrize(
@@ -164,9 +157,7 @@ def test_without_a_package_the_line_that_installs_it_is_printed(
     run: Path, monkeypatch: pytest.MonkeyPatch, package: str, words: tuple[str, ...], missing: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    shown = rack("plot", run, COUNT, *words)
-    assert (shown.returncode, shown.stdout) == (1, "")
-    assert shown.stderr.startswith(missing)
+    assert read_refusal(rack("plot", run, COUNT, *words), status=1).startswith(missing)
 
 
 @pytest.mark.slow
@@ -174,24 +165,20 @@ def test_of_a_running_rack_the_recording_so_far_is_plotted(tmp_path: Path, rack_
     with held_rack(tmp_path, rack_name, "--out", tmp_path / "run"):
         assert rack("step", rack_name, "--ticks", "200").returncode == 0
         found: dict[str, Any] = {}
+
+        def has_curves() -> bool:
+            found.update(json.loads(rack("plot", rack_name, "counter.status.row", "--json").stdout))
+            return "curves" in found
+
         # The recorder writes a little later than the rack.
-        wait_until(
-            lambda: (
-                found.update(
-                    json.loads(rack("plot", rack_name, "counter.status.row", "--json").stdout)
-                )
-                or "curves" in found
-            )
-        )
+        wait_until(has_curves)
     assert found["curves"][0]["time_s"][:3] == pytest.approx([0.0, 0.01, 0.02])
     assert found["title"] == rack_name
 
 
 @pytest.mark.slow
-def test_a_rack_that_is_not_recorded_is_refused(small: Path, rack_name: str) -> None:
-    with Rack(load(small, [f"name={rack_name}"])):
-        shown = rack("plot", rack_name, COUNT)
-    assert (shown.returncode, shown.stderr) == (
-        1,
-        f"{rack_name}: the rack is not recorded; 'rack record {rack_name}' records it\n",
-    )
+def test_a_rack_that_is_not_recorded_is_refused(config: RackConfig) -> None:
+    with Rack(config):
+        refusal = read_refusal(rack("plot", config.name, COUNT), status=1)
+    what_to_do = f"'rack record {config.name}' records it"
+    assert refusal == f"{config.name}: the rack is not recorded; {what_to_do}"

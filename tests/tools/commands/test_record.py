@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import load
+from rack.boards.config import RackConfig, load
 from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
@@ -83,8 +83,7 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
     # nothing.
     settings += ["--set", "clock.speed=0.2"]
     with Popen(
-        [*RACK, "run", str(small), "--json", *settings],
-        stdout=subprocess.DEVNULL,
+        [*RACK, "run", str(small), "--json", *settings], stdout=subprocess.DEVNULL
     ) as process:
         try:
             # Some rows of every ring are on the disk.
@@ -120,12 +119,12 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
     assert report["recording"] == "without the end of the run"
 
 
-def test_an_unrecorded_rack_cannot_be_saved(small: Path, rack_name: str, tmp_path: Path) -> None:
-    with Rack(load(small, [f"name={rack_name}"])):
-        with pytest.raises(Failure, match=f"--save {rack_name}: the rack is not recorded"):
-            record(rack_name, out=tmp_path / "saved", save=True)
+def test_an_unrecorded_rack_cannot_be_saved(config: RackConfig, tmp_path: Path) -> None:
+    with Rack(config):
+        with pytest.raises(Failure, match=f"--save {config.name}: the rack is not recorded"):
+            record(config.name, out=tmp_path / "saved", save=True)
         with pytest.raises(Failure, match="--save, --view: give one of them"):
-            record(rack_name, out=None, view=True, save=True)
+            record(config.name, out=None, view=True, save=True)
 
 
 @pytest.mark.slow

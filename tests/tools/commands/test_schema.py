@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_refusal
 
 
 def test_without_a_table_it_lists_the_tables(small: Path) -> None:
@@ -29,7 +29,5 @@ def test_each_key_of_a_table_has_unit_range_default_and_meaning(small: Path) -> 
 
 
 def test_an_unknown_table_ends_with_status_2_and_one_line(small: Path) -> None:
-    done = rack("schema", "clok", "--config", small)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith('TABLE = "clok": no such table; tables: rack, clock, ')
-    assert len(done.stderr.splitlines()) == 1
+    refusal = read_refusal(rack("schema", "clok", "--config", small))
+    assert refusal.startswith('TABLE = "clok": no such table; tables: rack, clock, ')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
 from tests.boards.table_racks import counting
 from tests.processes import wait_until
-from tests.tools.command_line import BOUND_S, rack
+from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal
 from tests.tools.held_racks import held_rack
 
 
@@ -29,9 +28,7 @@ def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
     """Step a rack, and return the tick before which it holds and the row of its counter."""
-    done = rack("step", name, *options, "--json")
-    assert done.returncode == 0, done.stderr
-    answer = json.loads(done.stdout)
+    answer = read_answer("step", name, *options)
     return answer["tick"], next(level for level in answer["levels"] if level["level"] == "counter")
 
 
@@ -104,8 +101,5 @@ def test_options_that_contradict_are_usage_errors() -> None:
 def test_real_time_cannot_be_stepped(tmp_path: Path) -> None:
     path = tmp_path / "counting.toml"
     path.write_text(counting(tmp_path).replace('mode = "lockstep"', 'mode = "realtime"'))
-    done = rack("run", path, "--no-record", "--step")
-    assert (done.returncode, done.stderr) == (
-        2,
-        "--step: real time cannot be held between two ticks; add --lockstep\n",
-    )
+    refusal = read_refusal(rack("run", path, "--no-record", "--step"))
+    assert refusal == "--step: real time cannot be held between two ticks; add --lockstep"

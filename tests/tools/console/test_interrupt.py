@@ -48,14 +48,17 @@ class Run:
             start_new_session=True,
         )
 
-    def ended(self) -> tuple[int, str]:
-        """Wait for the end; return the exit status, as a shell has it, and what was said on
-        stderr."""
+    def end(self) -> tuple[int, str]:
+        """Wait for an end that leaves nothing; return the exit status, as a shell has it, and what
+        was said on stderr."""
         try:
             _, said = self.process.communicate(timeout=BOUND_S)
         finally:
             self.process.kill()
             self.process.communicate()
+        # The boards die with the crate, a moment later.
+        wait_until(lambda: not named(f"{self.name}:") and not children_of(self.process.pid))
+        assert not [path.name for path in SHM_FOLDER.iterdir() if self.name in path.name]
         status = self.process.returncode
         return (128 - status if status < 0 else status), said
 
@@ -64,12 +67,6 @@ class Run:
         says so."""
         is_there = (self.folder / "report.json").is_file()
         return is_there or "no time for the report: 'rack report" in said
-
-    def leaves_nothing(self) -> bool:
-        """Return whether no shared memory is left; the boards die with the crate, a moment
-        later."""
-        wait_until(lambda: not named(f"{self.name}:") and not children_of(self.process.pid))
-        return not [path.name for path in SHM_FOLDER.iterdir() if self.name in path.name]
 
 
 @pytest.mark.slow
@@ -83,9 +80,8 @@ def test_a_signal_at_any_moment_ends_a_run_and_leaves_nothing(
     small: Path, rack_name: str, tmp_path: Path, moment: str, number: signal.Signals
 ) -> None:
     run = Run(small, rack_name, tmp_path / "run", moment, (number,))
-    status, said = run.ended()
+    status, said = run.end()
     assert status == 128 + number, said
-    assert run.leaves_nothing()
     assert "Traceback" not in said
     assert "cannot import" not in said
     assert run.reported(said) == (moment in BEGUN)
@@ -98,9 +94,8 @@ def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
     run, log = Run(small, rack_name, tmp_path / "run"), tmp_path / "run" / "events.jsonl"
     wait_until(lambda: log.is_file() and '"outcome"' in log.read_text())
     run.process.send_signal(TERM)
-    status, said = run.ended()
+    status, said = run.end()
     assert status == 128 + TERM
-    assert run.leaves_nothing()
     assert run.reported(said)
 
 
@@ -113,10 +108,9 @@ def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     run = Run(small, rack_name, tmp_path / "run", "", (number,))
     time.sleep(delay_s)
     os.killpg(run.process.pid, number)
-    status, said = run.ended()
+    status, said = run.end()
     # Before the command has come to its first line it is Python's own end.
     assert status == 128 + number or (delay_s < 0.1 and status), said
-    assert run.leaves_nothing()
 
 
 @pytest.mark.slow
@@ -149,7 +143,6 @@ def test_under_nohup_a_run_outlives_its_terminal_and_ends_by_other_signals(
         run = Run(small, rack_name, tmp_path / "run", "cycle", (HUP, TERM))
     finally:
         signal.signal(HUP, before)
-    status, said = run.ended()
+    status, said = run.end()
     assert status == 128 + TERM
-    assert run.leaves_nothing()
     assert "SIGTERM received" in said + (tmp_path / "run" / "events.jsonl").read_text()

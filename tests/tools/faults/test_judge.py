@@ -11,7 +11,7 @@ from rack.backplane.fault_table import NEVER
 from rack.boards.events import Event
 from rack.tools.faults import judge
 from rack.tools.faults.ending import EXTERNAL, Strike
-from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, judge_faults
+from rack.tools.faults.judge import Circumstances, FaultVerdict, Judge, Judgement
 from tests.tools.fault_events import LAYOUT, TICK_NS, box, event, flows, found, strike
 
 END = event(10_000, "end", "")
@@ -40,7 +40,7 @@ INVALID, LIMIT = (
 
 
 def verdict(strikes: list[Strike], *events: Event, run: Circumstances = REAL_TIME) -> FaultVerdict:
-    return judge_faults(strikes, [*events, END], run)
+    return Judge(strikes, [*events, END], run).judge_all()
 
 
 def judged(one: Strike, *events: Event, run: Circumstances = REAL_TIME) -> Judgement:
@@ -286,16 +286,16 @@ def test_reactions_after_the_next_fault_belong_to_that_fault() -> None:
 
 def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
     ends = [[INVALID, CLOSED, replace(END, tick=end)] for end in (209, 210)]
-    faults = [judge_faults([NAN], events, REAL_TIME).faults[0] for events in ends]
+    faults = [Judge([NAN], events, REAL_TIME).judge_all().faults[0] for events in ends]
     assert [fault.is_recovered for fault in faults] == [True, False]
 
 
 def test_nothing_recovers_from_a_fault_of_messages_without_an_end() -> None:
     end, silent = replace(END, tick=200), replace(MUTE, ends=NEVER)
-    (fault,) = judge_faults([silent], [flows(99), SEEN, end], REAL_TIME).faults
+    (fault,) = Judge([silent], [flows(99), SEEN, end], REAL_TIME).judge_all().faults
     assert (fault.seen, fault.struck, fault.is_recovered) == ("detected", 100, False)
     # One that was to end says nothing yet.
-    (fault,) = judge_faults([replace(MUTE, ends=900)], [SEEN, end], REAL_TIME).faults
+    (fault,) = Judge([replace(MUTE, ends=900)], [SEEN, end], REAL_TIME).judge_all().faults
     assert fault.seen == "not struck"
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from rack.backplane.fault_table import NEVER, FaultTable, Stage
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
-from rack.boards.config import load, resolve
+from rack.boards.config import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.faults import live
 from rack.tools.faults.live import LiveRack
 from tests.processes import in_thread, wait_until
+from tests.tools.conftest import MakeSegment
 
 TICK = 100
 
@@ -47,12 +45,8 @@ class Running:
 
 
 @pytest.fixture
-def rack(small: Path, rack_name: str) -> Iterator[Running]:
-    config = load(small, [f"name={rack_name}"])
-    segment = Segment.create(resolve(config).layout, config.to_toml_text())
-    yield Running(segment)
-    segment.close()
-    unlink_segment(rack_name)
+def rack(config: RackConfig, make_segment: MakeSegment) -> Running:
+    return Running(make_segment(config))
 
 
 def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> None:

@@ -121,13 +121,21 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
     return Recording(run)
 
 
-def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
-    """Return the run that continues another run."""
-    arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
-    done = rack("run", *arguments)
+def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
+    """Return the run that continues another run without a note."""
+    options = [option for setting in settings for option in ("--set", setting)]
+    names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
+    done = rack("run", *names, *options)
     assert not done.stderr
     assert json.loads(done.stdout)["recording"] == "complete"
     return Recording(folder)
+
+
+def check_repetition(one: Recording, two: Recording, ticks: Sequence[int]) -> None:
+    """Check that a run equals the one that it continues, with commands at these ticks."""
+    assert find_first_difference(one, two) is None
+    assert one.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
+    assert two.read_signal("upper.operator", "tick").tolist() == ticks
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +147,8 @@ def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.mark.slow
-def test_an_operators_command_is_not_mistaken_for_one_of_the_config(
-    in_lockstep: Recording,
-) -> None:
-    given = requests(in_lockstep.rack_config, *GIVEN)
-    assert load_operator_commands(in_lockstep) == given
+def test_an_operators_command_is_not_mistaken_for_one_of_the_config(in_lockstep: Recording) -> None:
+    assert load_operator_commands(in_lockstep) == requests(in_lockstep.rack_config, *GIVEN)
 
 
 @pytest.mark.slow
@@ -151,14 +156,11 @@ def test_an_operators_command_is_not_mistaken_for_one_of_the_config(
 def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
-    two = repeated(in_lockstep, tmp_path / "two", at)
-    assert find_first_difference(in_lockstep, two) is None
-    assert two.read_signal("upper.operator", "tick").tolist() == ticks
+    two = continued(in_lockstep, at, tmp_path / "two")
+    check_repetition(in_lockstep, two, ticks)
     # Under a name of its own, the rack writes the name of the original one.
     name = in_lockstep.rack_config.name
-    reasons = set(two.read_signal("upper.status", "reason").tolist())
-    assert reasons == {f"rack command {name}"}
-    assert in_lockstep.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
+    assert set(two.read_signal("upper.status", "reason").tolist()) == {f"rack command {name}"}
 
 
 @pytest.mark.slow
@@ -180,7 +182,7 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
     rack_name: str, tmp_path: Path
 ) -> None:
     one = commanded(tmp_path, rack_name, "realtime")
-    two = repeated(one, tmp_path / "two")
+    two = continued(one, 0.0, tmp_path / "two")
     assert two.rack_config.clock.mode == "lockstep"
     missed = [miss["tick"] for miss in list_misses(one)]
     difference = find_first_difference(one, two)
@@ -208,23 +210,11 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return one
 
 
-def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
-    """Return the run that continues another run without a note."""
-    options = [option for setting in settings for option in ("--set", setting)]
-    names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
-    done = rack("run", *names, *options)
-    assert (done.returncode, done.stderr) == (0, "")
-    return Recording(folder)
-
-
 @pytest.mark.slow
 def test_a_run_continues_after_the_last_command_of_its_operators(
     by_hand: Recording, tmp_path: Path
 ) -> None:
-    two = continued(by_hand, 0.7, tmp_path / "two")
-    assert find_first_difference(by_hand, two) is None
-    assert two.read_signal("upper.operator", "tick").tolist() == []
-    assert by_hand.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
+    check_repetition(by_hand, continued(by_hand, 0.7, tmp_path / "two"), [])
 
 
 @pytest.mark.slow
@@ -232,14 +222,9 @@ def test_a_command_that_waits_in_a_snapshot_is_issued_once(
     by_hand: Recording, tmp_path: Path
 ) -> None:
     two = continued(by_hand, 0.3, tmp_path / "two")
-    assert find_first_difference(by_hand, two) is None
-    assert by_hand.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
-    assert two.read_signal("upper.operator", "tick").tolist() == [140, 260]
+    check_repetition(by_hand, two, [140, 260])
     # Those that two repeats wait in the snapshot at tick 240.
-    three = continued(two, 0.6, tmp_path / "three")
-    assert three.read_signal("upper.operator", "tick").tolist() == [260]
-    assert find_first_difference(two, three) is None
-    assert by_hand.end_counts["outcome"]["digest"] == three.end_counts["outcome"]["digest"]
+    check_repetition(two, continued(two, 0.6, tmp_path / "three"), [260])
 
 
 @pytest.mark.slow

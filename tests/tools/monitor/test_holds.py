@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,25 +9,20 @@ import pytest
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.config import load, resolve_layout
+from rack.boards.config import load
 from rack.levels.operator import Answer, Goal, Operation
 from rack.tools.monitor.holds import STANDSTILL_S, StandstillDetector, find_holds
 from rack.tools.monitor.newest_messages import NewestMessages
-from tests.boards.commanded_racks import COMMANDED
+from tests.tools.conftest import MakeSegment
 
 TICK_S = 0.0025
 
 
 @pytest.fixture
-def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
-    (tmp_path / "told.toml").write_text(COMMANDED)
-    config = load(tmp_path / "told.toml", [f"name={rack_name}"])
-    made = Segment.create(resolve_layout(config), config.to_toml_text())
-    yield made
-    made.close()
-    unlink_segment(rack_name)
+def segment(commanded: Path, rack_name: str, make_segment: MakeSegment) -> Segment:
+    return make_segment(load(commanded, [f"name={rack_name}"]))
 
 
 def give(segment: Segment, *whats: Operation) -> None:

@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.segment import Segment, unlink_segment
 from rack.boards import Rack
-from rack.boards.config import load, resolve_layout
+from rack.boards.config import load
 from rack.tools.monitor.host_side import EntryRow, list_entry_rows
 from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
 from tests.processes import RACK
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_answer, read_refusal
+from tests.tools.conftest import MakeSegment
 from tests.warm import Popen
 
 
@@ -39,36 +39,30 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "hosted.toml").write_text(HOSTED)
     settings = ["--set", f"name=entries-{os.getpid()}", "--set", "host.program.params.count=12"]
-    done = rack("run", folder / "hosted.toml", *settings, "--out", folder / "run", "--json")
-    return folder / "run", json.loads(done.stdout)
+    out = ("--out", folder / "run")
+    return folder / "run", read_answer("run", folder / "hosted.toml", *settings, *out)
 
 
 def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
-    hosted: Path, rack_name: str
+    hosted: Path, rack_name: str, make_segment: MakeSegment
 ) -> None:
-    config = load(hosted, [f"name={rack_name}"])
-    layout = resolve_layout(config)
-    segment = Segment.create(layout, config.to_toml_text())
-    try:
-        newest = NewestMessages(segment)
-        assert list_entry_rows(newest) == ()
-        writer = open_writer(segment, "bridge.status")
-        for entry, counts in (
-            ("numbers", {"passed": 7, "refused": 2, "age": 4}),
-            ("sum", {"superseded": 3, "full": 5, "waiting": 1, "age": -1}),
-        ):
-            for name, value in counts.items():
-                getattr(writer.message, entry)[name] = value
-        writer.write(0)
-        writer.close()
-        age_ms = 4 * layout.clock_ns * 1e-6
-        assert list_entry_rows(newest) == (
-            EntryRow("bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms),
-            EntryRow("bridge.sum", "adder.status", 0, 0, 3, 5, 1, None),
-        )
-    finally:
-        segment.close()
-        unlink_segment(rack_name)
+    segment = make_segment(load(hosted, [f"name={rack_name}"]))
+    newest = NewestMessages(segment)
+    assert list_entry_rows(newest) == ()
+    writer = open_writer(segment, "bridge.status")
+    for entry, counts in (
+        ("numbers", {"passed": 7, "refused": 2, "age": 4}),
+        ("sum", {"superseded": 3, "full": 5, "waiting": 1, "age": -1}),
+    ):
+        for name, value in counts.items():
+            getattr(writer.message, entry)[name] = value
+    writer.write(0)
+    writer.close()
+    age_ms = 4 * segment.layout.clock_ns * 1e-6
+    assert list_entry_rows(newest) == (
+        EntryRow("bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms),
+        EntryRow("bridge.sum", "adder.status", 0, 0, 3, 5, 1, None),
+    )
 
 
 @pytest.mark.slow
@@ -101,9 +95,8 @@ def test_a_run_with_a_host_board_is_continued_with_its_messages(
     ]
     two = Recording(tmp_path / "two")
     assert two.read_signal("bridge.numbers", "tick").min() >= tick
-    refused = rack("run", *asked.split(), "--entries", run)
-    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert "--from replays the entries anyway" in refused.stderr
+    refusal = read_refusal(rack("run", *asked.split(), "--entries", run))
+    assert "--from replays the entries anyway" in refusal
 
 
 @pytest.mark.slow
@@ -114,24 +107,18 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     other = tmp_path / "other.toml"
     text = HOSTED.replace("numbers = {", "others = {")
     other.write_text(text.replace("[host", 'reads.number = "bridge.others"\n\n[host'))
-    done = rack("run", other, "--entries", run, "--no-record")
-    assert (done.returncode, done.stdout) == (2, "")
     said = "bridge.others: no such mailbox; needed: number 1, 24 bytes"
-    assert done.stderr == f"--entries {run}: {said}\n"
+    refusal = read_refusal(rack("run", other, "--entries", run, "--no-record"))
+    assert refusal == f"--entries {run}: {said}"
     none = rack("run", "k1607", "--set", f"name={rack_name}", "--entries", run, "--no-record")
-    assert none.returncode == 2
-    assert none.stderr == f"--entries {run}: '{rack_name}' has no adapter\n"
+    assert read_refusal(none) == f"--entries {run}: '{rack_name}' has no adapter"
 
 
 @contextmanager
 def console(hosted: Path, name: str) -> Iterator[Rack]:
     """Run a rack with an external host board."""
-    settings = [
-        f"name={name}",
-        "host.program.external=true",
-        "host.program.program=host_programs:Console",
-    ]
-    with Rack(load(hosted, settings)) as running:
+    external = ["host.program.external=true", "host.program.program=host_programs:Console"]
+    with Rack(load(hosted, [f"name={name}", *external])) as running:
         running.start()
         yield running
 
@@ -155,11 +142,8 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
             first.stdin.write("number(4)\nprint('sent')\n")
             while "sent" not in first.stdout.readline():
                 continue
-            second = rack("prompt", rack_name)
-            assert second.returncode == 1
-            assert (
-                second.stderr == f"host board 'program' is already running (process {first.pid})\n"
-            )
+            why = f"host board 'program' is already running (process {first.pid})"
+            assert read_refusal(rack("prompt", rack_name), status=1) == why
             status = rack("status", rack_name).stdout
             assert f"program  {first.pid}  running     1         0" in status
             first.kill()

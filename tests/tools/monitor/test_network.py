@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any
@@ -12,9 +11,8 @@ import pytest
 from rich.console import Console
 
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.boards.config.loader import load_text
-from rack.boards.config.resolved import resolve_layout
 from rack.levels.peer import Presence
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.network import (
@@ -30,6 +28,7 @@ from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.report.report import summarize_network
 from tests.boards.lan.racks import rack_text
+from tests.tools.conftest import MakeSegment
 
 TEXT = rack_text(
     "one", "tcp/127.0.0.1:7447", [], "other-one", peers=["third"], lan='on_peer_loss = "go on"'
@@ -47,10 +46,9 @@ COUNTS = {
 
 
 @pytest.fixture
-def segment(rack_name: str) -> Iterator[Segment]:
+def segment(rack_name: str, make_segment: MakeSegment) -> Segment:
     """Segment of a rack whose adapter has exchanged messages for a while."""
-    config = load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
-    made = Segment.create(resolve_layout(config), config.to_toml_text())
+    made = make_segment(load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"')))
     status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
     status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04, 0.5)
     status.message.export_pulse[...] = (12, 24)
@@ -59,9 +57,7 @@ def segment(rack_name: str) -> Iterator[Segment]:
     found.presence, found.launches, found.losses, found.since = Presence.LOST, 2, 1, 400
     found.offset, found.uncertainty = -0.5, 0.0002
     peer.write(8)
-    yield made
-    made.close()
-    unlink_segment(rack_name)
+    return made
 
 
 def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,27 +9,25 @@ import pytest
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand, System, TaskState
-from rack.boards.config import load, resolve_layout
+from rack.boards.config import load
 from rack.boards.config.injections import build_injections
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot, TaskRow
 from rack.tools.report.report import write_report
+from tests.tools.conftest import MakeSegment
 
 FAULT = 'fault=[{ kind = "mute", board = "lower" }]'
 
 
 @pytest.fixture
-def segment(small: Path, rack_name: str) -> Iterator[Segment]:
+def segment(small: Path, rack_name: str, make_segment: MakeSegment) -> Segment:
     config = load(small, [f"name={rack_name}", FAULT])
-    layout = resolve_layout(config)
-    made = Segment.create(layout, config.to_toml_text())
-    FaultTable(made).add_fault(build_injections(config, layout)[0])
-    yield made
-    made.close()
-    unlink_segment(rack_name)
+    made = make_segment(config)
+    FaultTable(made).add_fault(build_injections(config, made.layout)[0])
+    return made
 
 
 class Seen(Display):

@@ -9,16 +9,14 @@ import json
 import os
 import random
 import shutil
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load
+from rack.boards.config import load
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, format_checked_line, parse_checked_line
@@ -48,28 +46,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def damaged(run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(run, tmp_path / "run"))
-
-
-@pytest.fixture
-def config(small: Path, rack_name: str) -> RackConfig:
-    """A rack of two levels that count, without an arm."""
-    return load(small, [f"name={rack_name}"])
-
-
-@contextmanager
-def bounded() -> Iterator[None]:
-    """Fail if the test hangs."""
-
-    def give_up(number: int, frame: object) -> None:
-        raise TimeoutError(f"hangs for {BOUND_S} s")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(BOUND_S)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def read_values(folder: Path) -> object:
@@ -189,10 +165,7 @@ def test_nan_in_a_sensor_leaves_strict_json(tmp_path: Path, rack_name: str) -> N
     assert Event(**event).code == "sensor_range"
 
 
-PLACES: tuple[Callable[[Path], None], ...] = (
-    os.mkfifo,
-    lambda path: path.symlink_to("/dev/zero"),
-)
+PLACES: tuple[Callable[[Path], None], ...] = (os.mkfifo, lambda path: path.symlink_to("/dev/zero"))
 """Ways to put something else in a file's place."""
 
 
@@ -219,6 +192,7 @@ CASES = [
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(2 * BOUND_S)
 @pytest.mark.parametrize(("command", "name"), CASES)
 def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
     damaged: Path, tmp_path: Path, command: str, name: str
@@ -228,22 +202,21 @@ def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
     for take_place in PLACES:
         (damaged / name).unlink(missing_ok=True)
         take_place(damaged / name)
-        with bounded():
-            done = rack(*COMMANDS[command](damaged, tmp_path))
+        done = rack(*COMMANDS[command](damaged, tmp_path))
         assert done.returncode == 2, done
         assert Path(name).name in done.stderr
         assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(2 * BOUND_S)
 @pytest.mark.parametrize("name", ["report.json", "report.md"])
 def test_a_report_replaces_its_files_whatever_their_type(damaged: Path, name: str) -> None:
     whole = rack("report", damaged).stdout
     for take_place in PLACES:
         (damaged / name).unlink()
         take_place(damaged / name)
-        with bounded():
-            done = rack("report", damaged)
+        done = rack("report", damaged)
         assert (done.returncode, done.stdout) == (0, whole)
         assert (damaged / name).is_file()
         assert not (damaged / name).is_symlink()

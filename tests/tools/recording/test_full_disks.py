@@ -13,31 +13,21 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.segment import list_racks
-from rack.boards.config import RackConfig, load
+from rack.boards.config import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
+from rack.tools.launch.verdict import list_failures
 from rack.tools.monitor.display import Display
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recording import Recording
 from tests.processes import children_of
 from tests.tools.command_line import BOUND_S, rack
-from tests.tools.recording.struck_recorders import (
-    LONG_S,
-    FillingDisk,
-    Keeping,
-    realtime,
-)
+from tests.tools.recording.struck_recorders import LONG_S, FillingDisk, Keeping, realtime
 
 pytestmark = pytest.mark.thorough
 
 FULL_S = 40.0
 """Bound of the end of a run whose disk is full: well below what it would last."""
-
-
-@pytest.fixture
-def config(small: Path, rack_name: str) -> RackConfig:
-    """A rack of two levels that count, without an arm."""
-    return load(small, [f"name={rack_name}"])
 
 
 @pytest.mark.slow
@@ -62,9 +52,9 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     (folder / "events.jsonl").symlink_to("/dev/full")
     result = run_rack(config, 0.5, folder, display)
     assert (result.outcome.is_success, result.worked) == (True, False)
-    assert result.describe_failure().endswith(
+    assert list_failures(result.outcome, result.recording, result.failed) == [
         "the recording is incomplete: events.jsonl ends before the run"
-    )
+    ]
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 

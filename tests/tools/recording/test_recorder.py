@@ -10,22 +10,21 @@ import pytest
 
 from rack.backplane.words import Head, System
 from rack.boards import Rack
-from rack.boards.config import load
-from rack.tools.console.answer import Failure
+from rack.boards.config import RackConfig
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.current_run import find_run_folder
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import build_report
-from tests.shared_runs import SMALL_S, small_run
+from tests.shared_runs import SMALL_S
 
 TICKS = 1600
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return Recording(small_run(tmp_path_factory))
+def recording(run: Path) -> Recording:
+    return Recording(run)
 
 
 def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None:
@@ -46,19 +45,17 @@ def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None
 
 
 @pytest.mark.slow
-def test_recording_changes_nothing_in_a_run(
-    small: Path, rack_name: str, recording: Recording
-) -> None:
-    unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
+def test_recording_changes_nothing_in_a_run(config: RackConfig, recording: Recording) -> None:
+    unrecorded = run_rack(config, SMALL_S, None, Display())
     assert unrecorded.outcome.digest == build_report(recording)["digest"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_same_namespace", [True, False])
 def test_lockstep_does_not_wait_for_a_recorder_in_another_pid_namespace(
-    small: Path, rack_name: str, tmp_path: Path, is_same_namespace: bool
+    config: RackConfig, tmp_path: Path, is_same_namespace: bool
 ) -> None:
-    with Rack(load(small, [f"name={rack_name}"])) as rack:
+    with Rack(config) as rack:
         words = rack.segment.words
         namespace = words[Head.LAUNCHER_NAMESPACE]
         words[Head.LAUNCHER_NAMESPACE] += not is_same_namespace
@@ -69,8 +66,3 @@ def test_lockstep_does_not_wait_for_a_recorder_in_another_pid_namespace(
                 assert found == (tmp_path if is_same_namespace else None)
         finally:
             words[Head.LAUNCHER_NAMESPACE] = namespace
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(Failure, match="not a run: it has no config"):
-        Recording(tmp_path)

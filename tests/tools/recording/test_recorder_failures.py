@@ -30,24 +30,11 @@ from rack.tools.recording.spool import Spool, try_lock
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import write_report
 from tests.tools.analysis_text import text as analysis_text
-from tests.tools.recording.struck_recorders import (
-    LONG_S,
-    AtTick,
-    Held,
-    counts,
-    notes_of,
-    realtime,
-)
+from tests.tools.recording.struck_recorders import LONG_S, AtTick, Held, counts, notes_of, realtime
 
 pytestmark = pytest.mark.thorough
 
 WATCHDOG_S = 60.0
-
-
-@pytest.fixture
-def config(small: Path, rack_name: str) -> RackConfig:
-    """A rack of two levels that count, without an arm."""
-    return load(small, [f"name={rack_name}"])
 
 
 @pytest.mark.slow
@@ -155,8 +142,8 @@ def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
     lacking = f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing ({others})"
     assert result.recording == f"{lacking}; {gap}; the recorder ended with status -9"
-    assert result.describe_failure().endswith(result.recording)
     report, text = write_report(tmp_path / "run")
+    assert report["failures"][-1].endswith(result.recording)
     assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
     assert str(gap) in text
     assert report["gaps"] == [{"first": gap.first, "last": gap.last, "rings": gap.rings}]

@@ -24,7 +24,7 @@ from rack.tools.recording.run_files import TABLE_PATTERNS
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import write_report
 from rack.tools.timing.charts.gantt import find_subject
-from tests.shared_runs import nasrem_run, small_run
+from tests.shared_runs import nasrem_run
 
 READERS: tuple[Callable[[Path], object], ...] = (
     write_report,
@@ -38,11 +38,6 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "cut": lambda data: data[: len(data) // 2],
     "binary": lambda data: bytes(range(256)) * 4,
 }
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_run(tmp_path_factory)
 
 
 @pytest.fixture

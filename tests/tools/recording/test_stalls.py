@@ -14,12 +14,7 @@ from rack.boards.config.layout import find_core
 from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.recording.cycles import measure_budgets, read_cycles
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.stalls import (
-    Absence,
-    Quota,
-    Stalls,
-    analyze_stalls,
-)
+from rack.tools.recording.stalls import Absence, Quota, Stalls, analyze_stalls
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import build_report
 from rack.tools.report.report_markdown import format_markdown

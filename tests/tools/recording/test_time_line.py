@@ -11,18 +11,7 @@ import pytest
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.console.answer import Failure
 from rack.tools.recording.time_line import RackAlignment, align_racks
-from tests.tools.machines import (
-    CLOCK_NS,
-    ERROR_NS,
-    MS,
-    TICKS,
-    A,
-    B,
-    C,
-    Machine,
-    S,
-    recorded,
-)
+from tests.tools.machines import CLOCK_NS, ERROR_NS, MS, TICKS, A, B, C, Machine, S, recorded
 
 
 def check_place(place: RackAlignment, own: Machine, line: Machine) -> None:

@@ -28,7 +28,7 @@ from rack.tools.report.report import build_report, write_report
 from rack.tools.report.report_markdown import format_markdown, format_report
 from rack.tools.report.task_times import compute_task_times
 from rack.tools.timing.measured_response import measure_system_response
-from tests.boards.commanded_racks import COMMANDED, commands
+from tests.boards.commanded_racks import commands
 from tests.shared_runs import slow_run
 
 MS = 1_000_000
@@ -240,15 +240,14 @@ def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> No
 
 @pytest.mark.slow
 def test_a_report_shows_who_held_a_level_and_what_is_still_held(
-    rack_name: str, tmp_path: Path
+    commanded: Path, rack_name: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "commanded.toml").write_text(COMMANDED)
     given = commands(
         "level='upper', what='hold', tick=101",
         "level='upper', what='resume', tick=203",
         "level='lower', what='hold', tick=301",
     )
-    config = load(tmp_path / "commanded.toml", [f"name={rack_name}", given])
+    config = load(commanded, [f"name={rack_name}", given])
     run_rack(config, 20.0, tmp_path / "run", Watchful())
     report, text = write_report(tmp_path / "run")
     keys = ("level", "by", "why", "since_s", "until_s", "lasted_s")

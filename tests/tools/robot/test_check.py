@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.tools.command_line import ROOT, rack
+from tests.tools.command_line import ROOT, rack, read_answer, read_refusal
 from tests.tools.robot.models import written
 
 EXAMPLE = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.toml"
 pytestmark = pytest.mark.slow
 
 
-def checked(folder: Path, given: object, status: int) -> dict[str, Any]:
-    done = rack("robot", "check", given, "--json", "--out", folder / "arm.png", folder=folder)
-    assert done.returncode == status, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+def checked(folder: Path, given: object, status: int) -> Any:
+    words = ("robot", "check", given, "--out", folder / "arm.png")
+    return read_answer(*words, status=status, folder=folder)
 
 
 def failing(found: dict[str, Any]) -> dict[str, str]:
@@ -51,6 +48,6 @@ def test_contacts_at_home_unattached_bodies_and_endless_falls_fail(tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["a.xml", "a.sdf"])
 def test_a_file_that_is_not_a_model_is_refused(name: str, tmp_path: Path) -> None:
-    done = rack("robot", "check", written(tmp_path, "<sdf/>", name), folder=tmp_path)
-    assert done.returncode == 2
-    assert "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)\n" in done.stderr
+    model = written(tmp_path, "<sdf/>", name)
+    refusal = read_refusal(rack("robot", "check", model, folder=tmp_path))
+    assert refusal.endswith("<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)")

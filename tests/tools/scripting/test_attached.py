@@ -32,13 +32,6 @@ with Rack.from_file({path!r}, ["name={name}"]) as own, attach({name!r}) as live:
 """
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    path = tmp_path / "commanded.toml"
-    path.write_text(COMMANDED)
-    return path
-
-
 @pytest.fixture(scope="module", params=["lockstep", "realtime"])
 def own(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rack]:
     """A rack that runs in the background, until the last of its tests stops it."""
@@ -61,8 +54,7 @@ def live(own: Rack) -> Iterator[AttachedRack]:
 @pytest.mark.slow
 def test_a_rack_runs_while_its_program_reads_and_commands(own: Rack, live: AttachedRack) -> None:
     assert live.status().rack == own.config.name
-    tick = live.wait_until("lower.status.count > 20", BOUND_S)
-    assert tick >= 20
+    assert live.wait_until("lower.status.count > 20", BOUND_S) >= 20
     reading = live.read("lower.status")
     assert live["lower.status.count"] >= reading.message.count > 20
     assert live["lower.status.state"] == "executing"
@@ -119,12 +111,14 @@ def test_a_rack_is_stopped(own: Rack) -> None:
 
 
 @pytest.mark.slow
-def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(path: Path, rack_name: str) -> None:
+def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(
+    commanded: Path, rack_name: str
+) -> None:
     def fail(event: Event) -> None:
         if event.kind == "command":
             raise RuntimeError("no more")
 
-    config = Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]).config
+    config = Rack.from_file(commanded, [f"name={rack_name}", "clock.mode=lockstep"]).config
     with pytest.raises(RuntimeError, match="no more"), Rack(config, fail) as own:  # noqa: PT012
         own.run_in_background()
         own.command("upper", "hold")
@@ -135,14 +129,14 @@ def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(path: Path, rack_n
 @pytest.mark.slow
 @pytest.mark.parametrize(("then", "status"), [("sys.stdin.read()", 130), ("own.close = None", 0)])
 def test_a_program_that_is_interrupted_or_ends_leaves_nothing(
-    path: Path, rack_name: str, then: str, status: int
+    commanded: Path, rack_name: str, then: str, status: int
 ) -> None:
-    script = SCRIPT.format(path=str(path), name=rack_name, then=then)
+    script = SCRIPT.format(path=str(commanded), name=rack_name, then=then)
     if status == 0:
         # As in a notebook: nobody closes it.
         script = script.replace(
-            f'with Rack.from_file({str(path)!r}, ["name={rack_name}"]) as own,',
-            f'own = Rack.from_file({str(path)!r}, ["name={rack_name}"])\nown.launch()\nwith',
+            f'with Rack.from_file({str(commanded)!r}, ["name={rack_name}"]) as own,',
+            f'own = Rack.from_file({str(commanded)!r}, ["name={rack_name}"])\nown.launch()\nwith',
         ).replace("own.close = None", "pass")
     process = subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -157,9 +151,9 @@ def test_a_program_that_is_interrupted_or_ends_leaves_nothing(
     wait_until(lambda: not named(f"{rack_name}:"))
 
 
-def test_waiting_for_a_clock_that_was_not_started_fails(path: Path, rack_name: str) -> None:
+def test_waiting_for_a_clock_that_was_not_started_fails(commanded: Path, rack_name: str) -> None:
     with (
-        Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]),
+        Rack.from_file(commanded, [f"name={rack_name}", "clock.mode=lockstep"]),
         rack.attach(rack_name) as live,
         pytest.raises(rack.Failure, match=r"^mailbox 'lower\.status' has no message yet$"),
     ):

@@ -30,13 +30,6 @@ from tests.processes import BOUND_S
 LOCKSTEP = {"clock.mode": "lockstep"}
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    path = tmp_path / "commanded.toml"
-    path.write_text(COMMANDED)
-    return path
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -46,18 +39,19 @@ def path(tmp_path: Path) -> Path:
     ],
     ids=["nested", "dotted", "numpy"],
 )
-def test_settings_are_those_of_the_command(path: Path, settings: Mapping[str, Any]) -> None:
+def test_settings_are_those_of_the_command(commanded: Path, settings: Mapping[str, Any]) -> None:
     overrides = ["clock.period_ms=5", "clock.mode=lockstep", "board.lower.params.by=3"]
-    made = rack.Rack(path, lockstep=True, settings=settings)
-    assert made.config == load(path, overrides)
+    assert rack.Rack(commanded, lockstep=True, settings=settings).config == load(
+        commanded, overrides
+    )
 
 
-def test_values_of_python_become_those_of_a_config(path: Path) -> None:
+def test_values_of_python_become_those_of_a_config(commanded: Path) -> None:
     fault = {"kind": "kill", "board": "lower", "at": np.float64(0.5)}
-    settings = {"fault": (fault,), "python_path": [path.parent], 'board."lower".restarts': 2}
-    config = rack.Rack(path, settings=settings).config
+    settings = {"fault": (fault,), "python_path": [commanded.parent], 'board."lower".restarts': 2}
+    config = rack.Rack(commanded, settings=settings).config
     assert [(one.kind, one.board, one.at) for one in config.fault] == [("kill", "lower", 0.5)]
-    assert config.python_path == (path.parent,)
+    assert config.python_path == (commanded.parent,)
     assert config.board["lower"].restarts == 2
 
 
@@ -99,30 +93,30 @@ MISTAKES: dict[str, Any] = {
 
 @pytest.mark.parametrize(("why", "settings"), MISTAKES.items(), ids=MISTAKES)
 def test_mistakes_of_settings_have_the_sentences_of_the_command(
-    path: Path, why: str, settings: Any
+    commanded: Path, why: str, settings: Any
 ) -> None:
     if "list of 0" in why:
-        path.write_text(f"fault = []\n{COMMANDED}")
+        commanded.write_text(f"fault = []\n{COMMANDED}")
     with pytest.raises(rack.ConfigError) as found:
-        rack.Rack(path, settings=settings)
+        rack.Rack(commanded, settings=settings)
     assert str(found.value).startswith(why)
     assert isinstance(found.value, rack.Failure)
     assert (found.value.status, len(found.value.mistakes)) == (2, 1)
 
 
-def test_a_loaded_config_takes_no_settings(path: Path) -> None:
+def test_a_loaded_config_takes_no_settings(commanded: Path) -> None:
     with pytest.raises(TypeError, match="takes no settings"):
-        rack.Rack(load(path), settings=LOCKSTEP)
+        rack.Rack(load(commanded), settings=LOCKSTEP)
 
 
 @pytest.mark.slow
 def test_a_recorded_rack_leaves_the_run_of_the_command(
-    path: Path, tmp_path: Path, rack_name: str
+    commanded: Path, tmp_path: Path, rack_name: str
 ) -> None:
     heard: list[Event] = []
     out = tmp_path / "run"
     settings = {**LOCKSTEP, "name": rack_name}
-    with rack.Rack(path, settings=settings, out=out, on_event=heard.append) as own:
+    with rack.Rack(commanded, settings=settings, out=out, on_event=heard.append) as own:
         assert repr(own) == f"<rack '{rack_name}': not over, recorded into {out}>"
         outcome = own.run(1.0)
     assert repr(own) == f"<rack '{rack_name}': time over, recorded into {out}>"
@@ -138,12 +132,12 @@ def test_a_recorded_rack_leaves_the_run_of_the_command(
     with run.at(0.5).resume(seconds=1.0) as again:
         assert again.wait(BOUND_S) == outcome
     with pytest.raises(rack.Failure, match="exists already and is not an empty folder"):
-        rack.Rack(path, settings=settings, out=out)
+        rack.Rack(commanded, settings=settings, out=out)
 
 
 @pytest.mark.slow
 def test_a_rack_stays_until_its_recorder_has_begun(
-    path: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
+    commanded: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[float] = []
     wait: Callable[[RecorderProcess, float], bool] = RecorderProcess.wait_until_attached
@@ -156,7 +150,7 @@ def test_a_rack_stays_until_its_recorder_has_begun(
 
     monkeypatch.setattr(RecorderProcess, "wait_until_attached", note)
     settings = {**LOCKSTEP, "name": rack_name}
-    with rack.Rack(path, settings=settings, out=tmp_path / "run") as own:
+    with rack.Rack(commanded, settings=settings, out=tmp_path / "run") as own:
         own.run(0.1)
     assert waits == [recorder_process.ATTACH_S, math.inf]
     assert Recording(tmp_path / "run").end_counts["recording"] == "complete"
@@ -164,7 +158,7 @@ def test_a_rack_stays_until_its_recorder_has_begun(
 
 @pytest.mark.slow
 def test_a_rack_that_is_not_launched_leaves_no_folder(
-    path: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
+    commanded: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[RecorderProcess] = []
     start: Callable[[RecorderProcess], None] = RecorderProcess._start
@@ -175,7 +169,10 @@ def test_a_rack_that_is_not_launched_leaves_no_folder(
 
     monkeypatch.setattr(RecorderProcess, "_start", note)
     settings = {**LOCKSTEP, "name": rack_name, "board.lower.executor": "rack.levels.none:None"}
-    with pytest.raises(rack.ConfigError), rack.Rack(path, settings=settings, out=tmp_path / "run"):
+    with (
+        pytest.raises(rack.ConfigError),
+        rack.Rack(commanded, settings=settings, out=tmp_path / "run"),
+    ):
         pass
     assert not (tmp_path / "run").exists()
     (recorder,) = started
@@ -184,11 +181,12 @@ def test_a_rack_that_is_not_launched_leaves_no_folder(
 
 @pytest.mark.slow
 def test_a_recording_that_cannot_be_written_is_a_failure(
-    path: Path, tmp_path: Path, rack_name: str
+    commanded: Path, tmp_path: Path, rack_name: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    settings = {**LOCKSTEP, "name": rack_name}
-    own = rack.Rack(path, settings=settings, out=tmp_path / "file" / "run")
+    own = rack.Rack(
+        commanded, settings={**LOCKSTEP, "name": rack_name}, out=tmp_path / "file" / "run"
+    )
     with pytest.raises(rack.Failure, match=r"run: Not a directory$"), own:
         pass
 

@@ -16,7 +16,6 @@ from rack.boards.config import load
 from rack.boards.events import Event
 from rack.tools.recording.checksums import format_checked_line
 from rack.tools.recording.recording import Recording
-from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S
 from tests.shared_runs import SMALL_S, nasrem_run, small_run
 
@@ -131,9 +130,7 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
         signals["lower.status.reason"].plot()
 
 
-def test_a_plot_of_an_array_has_a_curve_a_number(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
+def test_a_plot_of_an_array_has_a_curve_a_number(tmp_path_factory: pytest.TempPathFactory) -> None:
     from matplotlib import pyplot
 
     axes = rack.open_run(nasrem_run(tmp_path_factory)).signals["servo.status.position"].plot()
@@ -142,26 +139,19 @@ def test_a_plot_of_an_array_has_a_curve_a_number(
     pyplot.close("all")
 
 
-def test_without_pandas_one_line_says_what_to_install(
+def test_without_a_package_one_line_says_what_to_install(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
+    for package in ("pandas", "matplotlib"):
+        monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(rack.Failure, match=r"^tables need pandas: pip install 'nasrem-rack\["):
         rack.open_run(small).to_pandas("lower.status")
-
-
-def test_without_matplotlib_one_line_says_what_to_install(
-    small: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(rack.Failure, match=r"^no pictures: they need matplotlib: pip install 'n"):
         rack.open_run(small).signals["lower.status.count"].plot()
 
 
-def test_a_rack_of_a_program_is_recorded(tmp_path: Path, rack_name: str) -> None:
-    path = tmp_path / "commanded.toml"
-    path.write_text(COMMANDED)
-    own = Rack(load(path, [f"name={rack_name}", "clock.mode=lockstep"]))
+def test_a_rack_of_a_program_is_recorded(commanded: Path, tmp_path: Path, rack_name: str) -> None:
+    own = Rack(load(commanded, [f"name={rack_name}", "clock.mode=lockstep"]))
     with own, rack.attach(rack_name) as live:
         live.record(tmp_path / "run")
         own.run_in_background(1.0)

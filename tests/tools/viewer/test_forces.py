@@ -60,8 +60,5 @@ def test_curves_show_wanted_and_exerted_forces(tmp_path: Path, cell: Cell) -> No
     written = Written(tmp_path)
     parts = build_task_force_curves(written.stream)
     written.write(ForceStatus, cell, parts, wrench=wrench, wanted=wanted, selected=selected)
-    assert read_component(written.file, "/forces/z").values[-1].tolist() == [
-        -20.0,
-        -18.0,
-    ]
+    assert read_component(written.file, "/forces/z").values[-1].tolist() == [-20.0, -18.0]
     assert np.isnan(read_component(written.file, "/forces/x").values[-1][0])

@@ -90,9 +90,7 @@ def merged_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "both.rrd"
 
 
-def test_each_rack_is_below_its_name_and_simultaneous_events_coincide(
-    merged_file: Path,
-) -> None:
+def test_each_rack_is_below_its_name_and_simultaneous_events_coincide(merged_file: Path) -> None:
     entities = {
         path.split("/")[1] for path in RrdReader(str(merged_file)).store().schema().entity_paths()
     }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import load
+from rack.boards.config import RackConfig
 from rack.tools.recording.spool import open_rings
 from rack.tools.viewer import sink
 from rack.tools.viewer.reading import read_component
@@ -23,11 +23,11 @@ BLOCK, PART = 40, 200
 
 @pytest.mark.slow
 def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
-    small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sink, "BLOCK_S", BLOCK * 2.5e-3)
     monkeypatch.setattr(sink, "PART_S", PART * 2.5e-3)
-    with Rack(load(small, [f"name={rack_name}"])) as rack:
+    with Rack(config) as rack:
         view = ViewSink(rack.segment, tmp_path, None)
         rack.run(TICKS * 2.5e-3)
         taken = {name: ring.read_new_rows().rows for name, ring in open_rings(rack.segment).items()}

@@ -18,7 +18,7 @@ from rack.tools.faults.campaigns.outages import Outage, list_outages
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.statistics import EventRate, compute_rate
 from rack.tools.faults.campaigns.trial import Trial
-from rack.tools.faults.judge import FaultVerdict, Judgement, Seen, judge_faults
+from rack.tools.faults.judge import FaultVerdict, Judge, Judgement, Seen
 
 Ended = Literal["task done", "verdicts certain", "safely stopped", "not armed", "neither"]
 
@@ -223,7 +223,7 @@ def _judge_faults(trial: Trial) -> FaultVerdict:
         tables = trial.plan.faults
         judged = tuple(_judge_start_fault(table["kind"], table["board"], trial) for table in tables)
         return FaultVerdict(judged, ())
-    return judge_faults(trial.strikes, trial.events, trial.run)
+    return Judge(trial.strikes, trial.events, trial.run).judge_all()
 
 
 def _judge_start_fault(kind: str, board: str, trial: Trial) -> Judgement:

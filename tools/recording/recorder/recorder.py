@@ -195,7 +195,6 @@ class Recorder:
         layout = segment.layout
         self._folder = folder
         self._view = view
-        self._segment = segment
         self._words = segment.words
         # Open the spool first, since it fails if another recorder is running, whose files must
         # then not be touched.

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load
 from rack.boards.config.resolved import resolve
-from rack.boards.errors import ConfigError
+from tests.boards.config.mistakes import find_mistake
 from tests.boards.conftest import PLANNED, MakeConfig
 
 HARDWARE = Path(__file__).parents[4] / "configs/examples/own-hardware/hardware.toml"
@@ -55,19 +54,14 @@ CASES: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_standby_that_cannot_be_is_refused_with_one_line(case: str, config: MakeConfig) -> None:
+def test_a_standby_that_cannot_be_is_refused_with_one_line(case: str) -> None:
     settings, line = CASES[case]
-    with pytest.raises(ConfigError) as caught:
-        resolve(config(*settings, text=PLANNED))
-    assert [str(mistake) for mistake in caught.value.mistakes] == [line]
+    assert find_mistake(PLANNED, *settings) == line
 
 
-def test_an_arm_that_is_not_simulated_has_one_process(rack_name: str) -> None:
-    settings = (f"board.servo.standby={ONE}", f"name={rack_name}")
-    with pytest.raises(ConfigError) as caught:
-        resolve(load(str(HARDWARE), settings))
-    (line,) = map(str, caught.value.mistakes)
-    assert "is not a simulation, and one process must drive it" in line
+def test_an_arm_that_is_not_simulated_has_one_process() -> None:
+    found = find_mistake(HARDWARE, f"board.servo.standby={ONE}")
+    assert "is not a simulation, and one process must drive it" in found
 
 
 def test_a_standby_follows_all_tasks_and_copies_its_wiring(config: MakeConfig) -> None:

@@ -120,20 +120,18 @@ class Pair:
 
     def lift(self, hoist: Hoist) -> None:
         """Let one hand come down, take the part and lift it."""
-        hoist.go(0.0)
-        self.run(0.6)
-        hoist.grip(CLOSED)
-        self.run(0.4)
-        hoist.go(UP_M)
-        self.run(0.6)
+        self._grip_below(hoist, CLOSED, 0.4, UP_M)
 
     def put_down(self, hoist: Hoist) -> None:
         """Let it put the part down, let go, and get out of the way."""
+        self._grip_below(hoist, OPEN, 0.3, AWAY_M)
+
+    def _grip_below(self, hoist: Hoist, opening: float, seconds: float, height: float) -> None:
         hoist.go(0.0)
         self.run(0.6)
-        hoist.grip(OPEN)
-        self.run(0.3)
-        hoist.go(AWAY_M)
+        hoist.grip(opening)
+        self.run(seconds)
+        hoist.go(height)
         self.run(0.6)
 
 

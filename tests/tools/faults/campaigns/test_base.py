@@ -28,17 +28,7 @@ MOVES = 1130
 SAMPLE = 12
 """Kinds of faults that are tried, of about 40."""
 MUTE = {"kind": "mute", "board": "lower", "tick": STRIKES, "for": "50ms"}
-OF_ONE_RUN = (
-    "wall_s",
-    "notes",
-    "start",
-    "whole",
-    "begins",
-    "ended",
-    "ticks",
-    "digest",
-    "touches",
-)
+OF_ONE_RUN = ("wall_s", "notes", "start", "whole", "begins", "ended", "ticks", "digest", "touches")
 """Fields of a result that are not of the verdict, or of its end."""
 
 
@@ -146,11 +136,7 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
     again = bench.run(plan)
     assert again.outcome is not None
     assert again.outcome.ticks == continued.outcome.ticks
-    assert (verdict(again), again.start, again.is_cut) == (
-        verdict(whole),
-        continued.start,
-        True,
-    )
+    assert (verdict(again), again.start, again.is_cut) == (verdict(whole), continued.start, True)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from rack.boards.config import load
+from rack.boards.config import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns import campaign as module
 from rack.tools.faults.campaigns.campaign import Campaign, Order
@@ -60,12 +60,9 @@ MakeCampaign = Callable[..., tuple[Campaign, Trials]]
 
 
 @pytest.fixture
-def make(
-    small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> MakeCampaign:
+def make(config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeCampaign:
     """Make a campaign in a folder of the test, whose trials all go well unless it says
     otherwise."""
-    config = load(small, [f"name={rack_name}"])
 
     def make_one(
         ends: Callable[[Plan], TrialResult] = struck, whole: bool = False, **given: Any

@@ -10,11 +10,7 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.launch import (
-    find_fastest_board,
-    find_first_cycle_ns,
-    measure_kills,
-)
+from rack.tools.lab.benches.launch import find_fastest_board, find_first_cycle_ns, measure_kills
 
 pytestmark = pytest.mark.thorough
 

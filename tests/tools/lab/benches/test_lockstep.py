@@ -12,10 +12,7 @@ from rack.boards import OneProcess
 from rack.boards.config import RackConfig, load
 from rack.tools.lab.benches.apart import run_in_board_environment
 from rack.tools.lab.benches.harness import Sample
-from rack.tools.lab.benches.lockstep import (
-    WITHOUT_RACK,
-    build_comparison,
-)
+from rack.tools.lab.benches.lockstep import WITHOUT_RACK, build_comparison
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 

@@ -96,11 +96,7 @@ def test_a_transport_that_loses_messages_is_noticed() -> None:
 
 
 def test_the_baseline_of_a_case_is_its_best_peer() -> None:
-    medians = {
-        "time-slice": 3.0,
-        "iceoryx2 blackboard": 5.0,
-        "multiprocessing pipe": 4.0,
-    }
+    medians = {"time-slice": 3.0, "iceoryx2 blackboard": 5.0, "multiprocessing pipe": 4.0}
     samples = [Sample("64 B", who, (value,), "us") for who, value in medians.items()]
     samples += [Sample("200 B", "time-slice", (3.0,), "us")]
     found = build_comparison(samples, ())
@@ -118,10 +114,7 @@ def test_a_bench_measures_every_protocol_and_names_absent_contestants(
     found = measure_mailboxes(cases, 3, Progress())
     names = {"200 B, 1 reader", "200 B, 4 readers"}
     assert {sample.case for sample in found.samples} == set(found.baselines) == names
-    assert {sample.who for sample in found.samples} >= {
-        *PROTOCOLS,
-        "multiprocessing pipe",
-    }
+    assert {sample.who for sample in found.samples} >= {*PROTOCOLS, "multiprocessing pipe"}
     assert all(sample.count == 3 and sample.best > 0 for sample in found.samples)
     assert (
         Absent("iceoryx2 blackboard", "No module named 'iceoryx2'", INSTALL_COMMAND) in found.absent

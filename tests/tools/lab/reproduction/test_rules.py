@@ -71,9 +71,7 @@ def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_or
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
-def test_each_equation_holds_in_nasrem_and_fails_in_its_counterexample(
-    name: str,
-) -> None:
+def test_each_equation_holds_in_nasrem_and_fails_in_its_counterexample(name: str) -> None:
     nasrem, failing = CLAIMS[name].predict()
     assert nasrem.checks
     assert describe_unmet(nasrem.checks) == ""

@@ -159,9 +159,7 @@ def with_a_lost_standby(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimV
     )
     return claim.judge(
         replication.ReplicationRun(
-            undisturbed=replace(crippled, digest="of no loss"),
-            alone=crippled,
-            replicated=crippled,
+            undisturbed=replace(crippled, digest="of no loss"), alone=crippled, replicated=crippled
         )
     )
 
