@@ -87,7 +87,8 @@ def test_a_signal_ends_launching_trials_and_keeps_finished_ones(
     small.write_text(text.replace("two_levels:Upper", "stalling:Stalling"))
     out = tmp_path / "campaign"
     before = semaphores_of_python()
-    options = (*LOCKSTEP, "--injections", "9", "--kinds", "kill", "--out", str(out))
+    # Trials of the second kind launch a rack. Others continue from a snapshot, without a self-test.
+    options = (*LOCKSTEP, "--kinds", "mute,self-test", "--out", str(out))
     process = subprocess.Popen(
         [*RACK, "campaign", str(small), *options],
         cwd=ROOT,
@@ -97,7 +98,7 @@ def test_a_signal_ends_launching_trials_and_keeps_finished_ones(
         text=True,
     )
     try:
-        wait_until(lambda: len(list(out.glob("stalls-*"))) == len(os.sched_getaffinity(0)), BOUND_S)
+        wait_until(lambda: len(list(out.glob("stalls-*"))) >= len(os.sched_getaffinity(0)), BOUND_S)
         racks = [f"camp-{worker}x" for worker in children_of(process.pid)]
         finished = sorted((out / "trials").glob("*.json"))
         for number in numbers:
