@@ -30,10 +30,12 @@ class BaseRack:
     """The faultless rack of one worker process.
 
     Its snapshots belong to the crate of the worker. Trials of the worker use the same rack name.
+    Its boards run on any of `cores`, or on the cores of the config if there are none.
     """
 
-    def __init__(self, config: RackConfig, name: str) -> None:
+    def __init__(self, config: RackConfig, name: str, cores: Set[int] = frozenset()) -> None:
         self.name = name
+        self._cores = cores
         self._config = config
         self._every = count_base_ticks(config)
         self._crate: WarmCrate | None = None
@@ -41,15 +43,12 @@ class BaseRack:
         self._reached = 0
         self._why_none = config.outside_state
 
-    def find_start(
-        self, plan: Plan, crate: WarmCrate | None, cores: Set[int] = frozenset()
-    ) -> Start:
+    def find_start(self, plan: Plan, crate: WarmCrate | None) -> Start:
         """Return the starting point of a trial. Run the faultless rack up to there if necessary.
 
         Args:
             plan: Plan of the trial.
             crate: Crate of the worker. None if it has none.
-            cores: As in `run_trial`.
         """
         if not (plan.faults or plan.kills):
             return Start()
@@ -57,25 +56,24 @@ class BaseRack:
             return Start(whole="real time")
         if not plan.first_tick:
             return Start(whole="a fault prevents the launch")
-        self.prepare(crate, plan.first_tick, cores)
+        self.run_to_snapshot(crate, plan.first_tick)
         if self._why_none:
             return Start(whole=f"{NO_SNAPSHOTS_PREFIX}{self._why_none}")
         return Start(continues=self._continue_before(plan.first_tick), events=self._trial.events)
 
-    def prepare(self, crate: WarmCrate, tick: int = 0, cores: Set[int] = frozenset()) -> None:
+    def run_to_snapshot(self, crate: WarmCrate, tick: int = 0) -> None:
         """Run the faultless rack as far as the last snapshot before a tick, if it can have one.
 
         Args:
             crate: Crate of the worker.
-            tick: The tick.
-            cores: As in `run_trial`.
+            tick: The tick. 0 for the first snapshot.
         """
         if not self._why_none:
             # Include the tick of the snapshot, so that it is taken.
             ticks = tick - tick % self._every + 1
-            self.run(crate, ticks * self._config.clock_ns * 1e-9, cores)
+            self.run(crate, ticks * self._config.clock_ns * 1e-9)
 
-    def run(self, crate: WarmCrate, seconds: float | None, cores: Set[int] = frozenset()) -> Trial:
+    def run(self, crate: WarmCrate, seconds: float | None, cores: Set[int] | None = None) -> Trial:
         """Return the faultless trial, run at least for a time in this crate.
 
         The trial continues from its last snapshot if it is not long enough yet.
@@ -83,7 +81,7 @@ class BaseRack:
         Args:
             crate: Crate of the worker, which keeps the snapshots.
             seconds: Simulated time in s after which the run ends. None to run until the task ends.
-            cores: As in `run_trial`.
+            cores: Cores on which the boards may run. None for those of this object.
         """
         if self._crate is not crate:
             self._crate = crate
@@ -99,7 +97,14 @@ class BaseRack:
                 events=self._trial.events,
             )
         self._trial = run_trial(
-            self._config, NOMINAL, self.name, 0, seconds, start=start, crate=crate, cores=cores
+            self._config,
+            NOMINAL,
+            self.name,
+            0,
+            seconds,
+            start=start,
+            crate=crate,
+            cores=self._cores if cores is None else cores,
         )
         self._reached = ticks
         reasons = (

@@ -153,7 +153,7 @@ class TrialRunner:
         self._core = core
         self._cores = os.sched_getaffinity(0)
         self._crate: WarmCrate | None = None
-        self._base = BaseRack(config, f"camp-{os.getpid()}x")
+        self._base = BaseRack(config, f"camp-{os.getpid()}x", {core})
 
     def start_crate(self) -> None:
         """Start the crate before the first trial, so that it imports the levels meanwhile."""
@@ -161,10 +161,10 @@ class TrialRunner:
         self._prepare_crate(lockstep=True)
 
     def prepare_base(self) -> None:
-        """Run the beginning of the faultless rack, from which most trials continue."""
+        """Take the first snapshot of the faultless rack, from which most trials continue."""
         crate = self._prepare_crate(lockstep=True)
         if crate is not None and not self._whole:
-            self._base.prepare(crate, cores={self._core})
+            self._base.run_to_snapshot(crate)
 
     def run_and_save(self, job: TrialJob) -> None:
         """Run a trial and save its result. In lockstep, use one core only."""
@@ -179,7 +179,7 @@ class TrialRunner:
                 # The other workers have nothing to do yet.
                 save_result(base.run(crate, job.seconds, self._cores), job.path)
                 return
-            start = base.find_start(job.plan, crate, cores)
+            start = base.find_start(job.plan, crate)
         trial = run_trial(
             self._config,
             job.plan,
@@ -225,7 +225,7 @@ def _start_crate() -> None:
 
 
 def _prepare_base() -> None:
-    """Run the beginning of the faultless rack of a worker process."""
+    """Take the first snapshot of the faultless rack of a worker process."""
     _runner.prepare_base()
 
 
