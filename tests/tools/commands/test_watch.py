@@ -18,7 +18,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.commands import watch
 from rack.tools.commands.step import Stepper
-from tests.processes import in_thread
+from tests.processes import in_thread, wait_until
 from tests.tools.command_line import rack, read_refusal
 from tests.tools.held_racks import held_rack
 
@@ -123,42 +123,39 @@ def test_a_window_around_a_trigger_is_saved(held: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "until", "said"),
+    ("words", "ticks", "said"),
     [
         (
             ("--when", "counter.status.row == 4", "--after", "30ms", "--out", "/dev/full"),
-            '"rows"',
+            8000,
             "/dev/full: No space left on device: cut off",
         ),
         (
             ("--when", "counter.status.row > 99"),
-            "",
+            800,
             "rack '{}': the condition has not held; the run is over",
         ),
     ],
     ids=["full disk", "never"],
 )
 def test_a_trigger_that_fails_or_does_not_fit_is_reported(
-    held: str, words: tuple[str, ...], until: str, said: str
+    held: str, words: tuple[str, ...], ticks: int, said: str
 ) -> None:
-    with in_thread(lambda: go_on(held, until, ticks=80)):
+    with in_thread(lambda: go_on(held, None, ticks)):
         done = rack("watch", held, "counter.status.fired", *words)
     assert read_refusal(done, status=1) == said.format(held)
 
 
-def go_on(name: str, until: str, ticks: int = 8000) -> None:
-    """Step a rack by 8 ticks until a text is printed or the command has ended, up to a number of
-    ticks, then end its run."""
+def go_on(name: str, until: str | None, ticks: int = 8000) -> None:
+    """Wait for a command to begin, then step a rack by 8 ticks until the command has printed a text
+    or ended, up to a number of ticks, and end the rack's run."""
     stepper = Stepper(Segment.attach(name))
     tick = stepper.hold_rack()
-    has_begun = False
+    # Before the command begins, and after its end, stdout is pytest's.
+    wait_until(lambda: isinstance(sys.stdout, StringIO))
     for step in range(0, ticks, 8):
-        # Before the command begins, and after its end, stdout is pytest's.
-        if isinstance(out := sys.stdout, StringIO):
-            has_begun = True
-            if until and until in out.getvalue():
-                break
-        elif has_begun:
+        out = sys.stdout
+        if not isinstance(out, StringIO) or (until is not None and until in out.getvalue()):
             break
         stepper.run_to(tick + step + 8)
         time.sleep(0.002)

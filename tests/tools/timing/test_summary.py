@@ -125,7 +125,11 @@ def test_the_command_in_the_verdict_measures_what_was_missing(
     lines = (line for line in printed.splitlines() if line.startswith("  rack "))
     first, second = map(shlex.split, lines)
     assert rack(*first[1:]).returncode == 0
-    assert "no budget" not in "\n".join(check_lines(*second[2:]))
+    done = rack(*second[1:])
+    # On a busy machine the measured times may not fit.
+    assert done.returncode in (0, 1)
+    assert done.stdout
+    assert "no budget" not in done.stdout
 
 
 def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -> None:
