@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 from rack.tools.commands.new import TEMPLATES
 from tests import warm
@@ -56,7 +58,24 @@ EXHAUSTIVE = "EXHAUSTIVE" in os.environ
 """Whether tests try all values of which they try a sample otherwise: `make thorough EXHAUSTIVE=1`,
 by hand, takes hours."""
 _NUMBERS = count()
-
+APART = frozenset(
+    f"tests/{name}.py"
+    for name in (
+        "backplane/mailbox/test_model",
+        "boards/config/rules/test_changed_values",
+        "boards/crate/test_random_ticks",
+        "boards/faults/test_every_fault",
+        "test_course",
+        "test_examples",
+        "test_golden",
+        "test_guides",
+        "test_ibm",
+        "test_rccl",
+        "tools/commands/test_campaign",
+        "tools/lab/reproduction/test_rulings",
+    )
+)
+"""Files of long tests that share nothing."""
 
 # A busy machine may hold up any example.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -90,11 +109,40 @@ def pytest_collection() -> Iterator[None]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run what judges real-time processes again if it has failed while the hypervisor held cores
-    back: that judges the machine. Without steal a failure is one at once."""
+    back: that judges the machine. Without steal a failure is one at once.
+
+    Long tests come first, and those that need the machine to themselves last, so that workers
+    seldom wait for each other.
+    """
     for item in items:
         if item.get_closest_marker("alone"):
             again = pytest.mark.flaky(reruns=RERUNS, condition=partial(_is_disturbed, item))
             item.add_marker(again)
+            item.add_marker(pytest.mark.xdist_group("alone"))
+    items.sort(key=_rank)
+
+
+def _rank(item: pytest.Item) -> tuple[bool, bool, bool]:
+    """Return the key by which tests are ordered. The files at the top run whole racks."""
+    file = item.nodeid.partition("::")[0]
+    return item.get_closest_marker("alone") is not None, file not in APART, file.count("/") > 1
+
+
+class Distribution(LoadFileScheduling):
+    """Hands out tests file by file, because the tests of a file share recorded runs; those of
+    `APART` one by one; and those marked `alone` together."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        """Return the name of the unit of work that a test belongs to."""
+        if nodeid.endswith("@alone"):
+            return "alone"
+        file = super()._split_scope(nodeid)
+        return nodeid if file in APART else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Distribution:
+    """Hand out tests by `Distribution`."""
+    return Distribution(config, log)
 
 
 def _is_disturbed(item: pytest.Item) -> bool:
