@@ -7,9 +7,7 @@ guess what the sentence is about.
 from __future__ import annotations
 
 import ast
-import io
 import re
-import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +25,7 @@ PATTERNS = {
     "'say whether' in place of 'return True if'": re.compile(r".*\bSay whether\b"),
 }
 """Matched from the beginning of a text."""
+COMMENT = re.compile(r"(?:^|\s)# *(.*)")
 SHORTEST_MESSAGE = 6
 """A string of at least as many words is read by people."""
 
@@ -42,9 +41,9 @@ def texts(source: str) -> Iterator[tuple[int, str]]:
             case ast.Constant(str(text)) if node not in documentation:
                 if len(text.split()) >= SHORTEST_MESSAGE:
                     yield node.lineno, " ".join(text.split())
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string.lstrip("# ")
+    for number, line in enumerate(source.splitlines(), 1):
+        if comment := COMMENT.search(line):
+            yield number, comment[1]
 
 
 def hits(source: str) -> list[str]:
@@ -86,12 +85,14 @@ def missing_attributes(source: str) -> list[str]:
     for owner in ast.walk(ast.parse(source)):
         if not isinstance(owner, ast.ClassDef):
             continue
+        _, _, section = (ast.get_docstring(owner) or "").partition("Attributes:\n")
+        if not section:
+            continue
         names = {node.name for node in ast.walk(owner) if isinstance(node, ast.FunctionDef)}
         for node in ast.walk(owner):
             match node:
                 case ast.Attribute(_, name, ast.Store()) | ast.Name(name, ast.Store()):
                     names.add(name)
-        _, _, section = (ast.get_docstring(owner) or "").partition("Attributes:\n")
         listed = re.findall(r"^    (\w+)(?:, (\w+))?:", section.partition("\n\n")[0], re.MULTILINE)
         missing += [
             f"{owner.name}.{name}" for pair in listed for name in pair if name and name not in names

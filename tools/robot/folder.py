@@ -18,8 +18,8 @@ name = "{name}"
 extends = ["nasrem"]
 
 [robot]
-# What follows is a guess, as the comments say. A simulated arm runs on it; any other is not enabled
-# until you have confirmed each key, and taken it from this list.
+# These values are guesses, as the comments say. A simulated arm runs on them; any other is not
+# enabled until you have confirmed each key, and taken it from this list.
 """
 STIFF = "stiff enough against dry friction"
 
