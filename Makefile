@@ -21,7 +21,7 @@ help: ## show this
 run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and the like are passed on
 	$(BIN)/rack run $(CONFIG) $(ARGS)
 
-test: $(STAMP) ## run the tests, about six minutes; ARGS="-k segment" and the like are passed on
+test: $(STAMP) ## run the tests, about five minutes; ARGS="-k segment" and the like are passed on
 	$(BIN)/python -m pytest -m "not thorough" $(ARGS)
 
 thorough: $(STAMP) ## run the tests that `make test` leaves out: whole tasks, all examples, the lab; ARGS as above; EXHAUSTIVE=1 leaves no samples

@@ -113,6 +113,7 @@ def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> Ran:
     return ran(name, tmp_path_factory.mktemp("brown"))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_modification_of_the_general_machine_is_put_in_over_the_network_without_a_step(
     run: Ran,
@@ -297,6 +298,7 @@ def find_responses(report: dict[str, Any], direction: str, end: str) -> list[dic
     return [one for one in found if one["levels"] and one["levels"][-1] == end]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
     rack_name: str, tmp_path: Path

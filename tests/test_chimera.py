@@ -125,6 +125,7 @@ def test_boards_are_scheduled_by_their_deadlines_on_their_cores(rack_name: str) 
     assert text in said
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @needs_fifo
 def test_a_refused_scheduler_ends_the_launch_with_one_line(rack_name: str) -> None:
@@ -139,6 +140,7 @@ def test_a_refused_scheduler_ends_the_launch_with_one_line(rack_name: str) -> No
     assert error.value.status == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @needs_fifo
 def test_a_board_goes_on_as_before_when_the_system_refuses_another_scheduler(
@@ -186,6 +188,7 @@ def run_overload(*settings: str, attempt: int = 1) -> Ran:
     return Ran({n: c.missed + c.skipped for n, c in counts.items()}, digest, reason, late)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_under_an_overload_urgency_alone_spares_the_critical_boards() -> None:
     fixed = run_overload()
@@ -222,7 +225,13 @@ LATE_BOARDS = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("settings", "count"), LATE_BOARDS)
+@pytest.mark.parametrize(
+    ("settings", "count"),
+    [
+        *LATE_BOARDS[:2],
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in LATE_BOARDS[2:]),
+    ],
+)
 def test_the_check_predicts_which_boards_are_late_under_each_scheduler(
     settings: tuple[str, ...], count: int
 ) -> None:
@@ -244,6 +253,7 @@ CHANGE = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_schedulers_change_while_the_rack_runs_and_the_arm_goes_on_when_told() -> None:
     held = run_overload(EARLIEST)

@@ -31,6 +31,7 @@ def ran(seconds: float, *settings: str) -> tuple[Outcome, list[Event], Message]:
         return outcome, rack.events, open_observer(rack.segment, "servo.status").peek().message
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_hardware_is_enabled_homed_faulted_reset_and_killed_and_goes_on() -> None:
     commands = (

@@ -58,6 +58,7 @@ def test_joints_without_one_board_are_refused_in_one_line(
     assert (mistake.place, mistake.why) == (place, reason)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(
     config: MakeConfig,

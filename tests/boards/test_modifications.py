@@ -125,6 +125,7 @@ def without(run: Callable[..., Ran]) -> Ran:
     return run("board.shoulder.params.modifications={}")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(
     switched: Ran, without: Ran

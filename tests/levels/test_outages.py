@@ -65,6 +65,7 @@ def draw_disturbance(chance: np.random.Generator, every: int) -> Disturbance:
     return kinds[int(chance.integers(len(kinds)))]
 
 
+@pytest.mark.thorough
 def test_the_task_is_done_in_spite_of_lost_delayed_or_reordered_messages() -> None:
     chance = np.random.default_rng(3)
     rack = WholeRack(actions=[TRANSFER])
@@ -77,6 +78,7 @@ def test_the_task_is_done_in_spite_of_lost_delayed_or_reordered_messages() -> No
     check(rack)
 
 
+@pytest.mark.thorough
 def test_the_object_stays_in_the_gripper_while_all_boards_that_hold_it_are_lost() -> None:
     rack = WholeRack(actions=[TRANSFER])
 
@@ -110,6 +112,7 @@ def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[i
     return found
 
 
+@pytest.mark.thorough
 def test_a_whole_task_finds_nothing_and_breaks_no_limit() -> None:
     rack = WholeRack("k1607", motion=load("k1607").scene.motion)
     assert run(rack, 60.0) == []
@@ -117,6 +120,7 @@ def test_a_whole_task_finds_nothing_and_breaks_no_limit() -> None:
     assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
 
 
+@pytest.mark.thorough
 def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm() -> None:
     rack = WholeRack("nasrem", motion=load("nasrem").scene.motion)
     assert run(rack, 15.0, seed=1) == []

@@ -279,6 +279,7 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
     assert guarded.rack not in list_racks()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_file_in_the_current_folder_is_no_module_of_a_crate_or_a_recorder(
     small: Path, rack_name: str, tmp_path: Path

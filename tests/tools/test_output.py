@@ -197,12 +197,13 @@ def test_a_pipe_gets_no_wide_line_about_a_running_rack(held: str) -> None:
         assert "\x1b" not in done.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
     [
         ("status NAME", "step NAME 2", "command NAME --list", "top NAME"),
-        pytest.param(LIVE, marks=pytest.mark.thorough),
+        LIVE,
     ],
     ids=["some", "all"],
 )
@@ -215,14 +216,13 @@ def test_a_closed_pipe_causes_no_traceback_while_a_rack_runs(
         assert "Traceback" not in done.stderr, line
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
     [
         ("check nasrem --verbose", "check fig3", "status NAME"),
-        pytest.param(
-            ("schema timing", "inject --list", "analyze RUN --verbose"), marks=pytest.mark.thorough
-        ),
+        ("schema timing", "inject --list", "analyze RUN --verbose"),
     ],
     ids=["some", "more"],
 )

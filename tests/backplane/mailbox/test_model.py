@@ -146,6 +146,7 @@ def test_the_protocol_holds_in_every_state_of_a_take_over(memory: Memory, case: 
     assert exploration.states > 1_000
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_on_x86_it_holds_without_fences() -> None:
     """Plain loads and stores are enough there: those of Python are such."""

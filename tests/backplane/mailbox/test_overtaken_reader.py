@@ -109,7 +109,9 @@ class Overtaken:
         self._slots.places[serial % DEPTH][:half] = self._slots.record[:half]
 
 
-@pytest.mark.parametrize("protocol", ["time-slice", "double-buffer"])
+@pytest.mark.parametrize(
+    "protocol", ["time-slice", pytest.param("double-buffer", marks=pytest.mark.thorough)]
+)
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
     link: MakeLink, protocol: Protocol, kind: str

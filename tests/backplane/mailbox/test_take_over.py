@@ -167,7 +167,9 @@ MOST_STORES = 100
 
 
 @pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("is_stopped", [False, True], ids=["dead", "stopped"])
+@pytest.mark.parametrize(
+    "is_stopped", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["dead", "stopped"]
+)
 def test_a_kill_at_any_store_between_claim_and_publication_leaves_a_whole_mailbox(
     make_bus: MakeBus, is_stopped: bool
 ) -> None:

@@ -118,6 +118,7 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(
     assert ready[0].startswith(f"wave on core {core}: rack '{first.config.name}'")
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.skipif(
     os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE"

@@ -212,6 +212,7 @@ def launched(path: Path, name: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothing(
     tmp_path: Path, rack_name: str

@@ -90,6 +90,7 @@ def test_nasrem_continues_from_random_ticks(run: str, rack_name: str) -> None:
     assert strays(config, SECONDS, COUNT) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_rack_with_restarts_and_holds_continues_from_some_ticks(rack_name: str) -> None:
     settings = [f"name={rack_name}", "clock.mode=lockstep", HOLDS]

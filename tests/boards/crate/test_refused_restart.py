@@ -23,6 +23,7 @@ FIVE_MAY = 65_524
 """A user who may have five processes."""
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @as_root
 @pytest.mark.filterwarnings(FORKS)

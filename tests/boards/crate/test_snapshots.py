@@ -86,7 +86,14 @@ def ticks_on(crate: WarmCrate) -> list[int]:
     return [tick for tick in found[::-1] if tick >= 0]
 
 
-@pytest.mark.parametrize("settings", [(), LOOSE, ("protocol.default=lock",)])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        (),
+        pytest.param(LOOSE, marks=pytest.mark.thorough),
+        pytest.param(("protocol.default=lock",), marks=pytest.mark.thorough),
+    ],
+)
 def test_a_run_continues_from_each_snapshot_to_the_same_digest(
     config: MakeConfig, crate: WarmCrate, settings: Sequence[str]
 ) -> None:
@@ -132,7 +139,13 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     return digest_of(load(str(path), [f"name=test-unsnapped-{os.getpid()}"]), SECONDS)
 
 
-@pytest.mark.parametrize("case", STANDBYS)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=() if case == "board, both killed" else pytest.mark.thorough)
+        for case in STANDBYS
+    ],
+)
 def test_a_rack_with_a_standby_continues_to_the_digest_of_the_original(
     config: MakeConfig, crate: WarmCrate, plain: str, case: str
 ) -> None:
@@ -168,6 +181,7 @@ SLOW: Sequence[tuple[Mapping[str, Any], Sequence[int]]] = (
 """Faults that take simulated time, and ticks while they do."""
 
 
+@pytest.mark.thorough
 def test_a_run_continues_from_the_middle_of_a_cycle_that_takes_simulated_time(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
@@ -235,6 +249,7 @@ def test_a_finished_task_ends_the_continued_run(config: MakeConfig, crate: WarmC
     assert outcome.digest == expected.digest
 
 
+@pytest.mark.thorough
 def test_a_branch_differs_after_its_snapshot(config: MakeConfig, crate: WarmCrate) -> None:
     rack = config(text=REMEMBERING)
     outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=210))
@@ -247,6 +262,7 @@ def test_a_branch_differs_after_its_snapshot(config: MakeConfig, crate: WarmCrat
     assert continued(rack, crate, 210).digest == outcome.digest
 
 
+@pytest.mark.thorough
 def test_a_run_with_faults_restarts_and_skipped_ticks_can_be_continued(
     config: MakeConfig, crate: WarmCrate
 ) -> None:

@@ -97,6 +97,7 @@ def names(rack_name: str) -> Iterator[tuple[str, str]]:
         remove_dead_rack(name)
 
 
+@pytest.mark.thorough
 @pytest.mark.alone
 def test_boards_and_racks_die_and_come_back(names: tuple[str, str], tmp_path: Path) -> None:
     (at,) = endpoints(1)

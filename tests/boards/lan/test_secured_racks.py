@@ -32,6 +32,7 @@ def taken(rack: str) -> int:
     return 0
 
 
+@pytest.mark.thorough
 def test_a_rack_that_sends_under_another_name_is_refused(rack_name: str, tmp_path: Path) -> None:
     names = [f"{rack_name}-{end}" for end in "ab"]
     for folder in ("certs", "certs/theirs"):

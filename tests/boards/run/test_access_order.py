@@ -286,6 +286,7 @@ def compile_all(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]
 MACHINE_CODE = {"publish": PUBLISH, "read": READ[:-1]}
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_machine_code_makes_the_accesses_of_the_model_in_its_order(
     compile_all: Callable[[], None],

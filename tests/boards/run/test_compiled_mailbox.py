@@ -227,7 +227,7 @@ def drive(
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@settings(max_examples=50)
 @given(PROTOCOLS, RATES, st.lists(OPERATIONS, min_size=20, max_size=60))
 def test_machine_code_leaves_every_byte_and_verdict_as_python_does(
     protocol: Protocol, rates: tuple[int, int], operations: list[Operation]

@@ -30,6 +30,7 @@ def hand_over(rack: str, rounds: int, cripple: str = "") -> Mapping[str, int]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(LIMIT_S)
 def test_no_hand_over_tears_a_message_or_makes_two_writers(rack_name: str) -> None:
     found = hand_over(rack_name, ROUNDS)

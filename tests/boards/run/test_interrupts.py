@@ -241,6 +241,7 @@ def in_time(found: Heard) -> np.ndarray:
     return cycles[is_in_time]
 
 
+@pytest.mark.thorough
 def test_in_real_time_interrupts_take_the_time_of_the_computation(config: MakeConfig) -> None:
     slow = "clock.speed=0.25"  # a tick lasts 10 ms, so messages come 2 ms after the release
     settings = ("clock.mode=realtime", slow, LONG, "board.hub.params.compute_ns=4000000", *FIRST)

@@ -32,6 +32,7 @@ def faults_of(pid: int) -> int:
     return int(fields[7]) + int(fields[9])
 
 
+@pytest.mark.thorough
 @needs_fifo
 def test_no_page_fault_comes_in_a_cycle_after_the_first_ones(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime", *PRIORITIES, text=PLAIN)) as rack:

@@ -48,6 +48,7 @@ def cyclic(phases: bool = True) -> str:
     return f"{CLOCK}{''.join(boards)}\n[timing]\ncontext_switch_ms = 0.0\n"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConfig) -> None:
     first, again = Rack(config(text=cyclic())), Rack(config(text=cyclic()))
@@ -101,6 +102,7 @@ def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
     assert steps.count(every) == len(steps) - 1
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime", text=cyclic())) as rack:

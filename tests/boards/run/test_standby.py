@@ -129,6 +129,7 @@ def test_a_kill_from_outside_at_any_moment_leaves_the_digest(
     assert outcome.digest == plain
 
 
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill", "stop"])
@@ -200,6 +201,7 @@ def test_the_standby_of_the_clock_gives_every_tick_once(
     assert (np.diff(ticks) == 1).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.alone
 @pytest.mark.slow
 def test_in_real_time_the_standby_of_the_clock_continues_its_grid(config: MakeConfig) -> None:

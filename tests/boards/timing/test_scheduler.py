@@ -202,6 +202,7 @@ def meets_demand(loads: Sequence[Load]) -> bool:
     )
 
 
+@pytest.mark.thorough
 def test_the_verdict_on_earliest_deadline_first_is_that_of_demand_and_schedule() -> None:
     rng = random.Random(49)
     fits = []

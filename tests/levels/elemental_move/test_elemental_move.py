@@ -48,6 +48,7 @@ def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> N
     assert longest * 10 < 100
 
 
+@pytest.mark.thorough
 def test_another_path_avoids_an_obstacle_that_moves_into_the_way() -> None:
     motion = post_moves((5.5, (0.6, 0.0, 0.9)))
     rack = WholeRack(arm="puma560_crossing", actions=[TRANSFER], motion=motion)
@@ -57,6 +58,7 @@ def test_another_path_avoids_an_obstacle_that_moves_into_the_way() -> None:
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
 
 
+@pytest.mark.thorough
 def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() -> None:
     motion = post_moves((2.5, (0.5, 0.30, 0.95)), (8.0, (0.5, 0.85, 0.95)))
     rack = WholeRack(arm="puma560_crossing", actions=[ABOVE_BLOCK], motion=motion)

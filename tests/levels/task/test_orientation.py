@@ -131,6 +131,7 @@ def test_a_grasp_leans_where_it_must(tmp_path: Path, bend: float, lean: float) -
     assert compute_lean(rehearse(program, SCENE, start)) == pytest.approx(lean, abs=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_five_joints_transfer_a_can(tmp_path: Path) -> None:
     to = [0.18, 0.15, 0.05]

@@ -18,7 +18,7 @@ from tests.tools.bridges.ros_racks import HeldRack, Peer, dds_peer, held_rack
 from tests.tools.command_line import BOUND_S, rack, read_refusal
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has no wheel for this Python")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 PUMA = ["j1", "j2", "j3", "j4", "j5", "j6"]
 WORDS = ("chimera", "--set", "host.command.external=true", "--ros2", "--no-record")
 

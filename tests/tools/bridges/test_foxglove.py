@@ -22,7 +22,7 @@ from tests.processes import runs, wait_until
 from tests.tools.bridges.ros_racks import HeldRack, held_rack
 from tests.tools.command_line import rack, read_refusal
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 HEAD = struct.Struct("<BIQ")
 
 

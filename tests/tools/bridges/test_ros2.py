@@ -125,6 +125,7 @@ def test_a_killed_bridge_leaves_the_rack_unhurt(arm: HeldRack, peer: Peer) -> No
     wait_until(lambda: any(not is_there for _, is_there in peer.ask("tokens")), BOUND_S)
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(300)
 def test_trajectories_move_an_arm_and_are_replayed_and_mistakes_are_one_line_each(
     peer: Peer, rack_name: str, tmp_path: Path

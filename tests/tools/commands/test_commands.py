@@ -159,6 +159,7 @@ def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
     assert said == [f'board.upper.executor = "own_upper:Upper": {reason}']
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_name: str) -> None:
     config = upper_of(small, "while True: pass")

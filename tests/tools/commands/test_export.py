@@ -33,6 +33,7 @@ def export(run: Path, kind: str) -> int:
     return int(answer["slices" if kind == "perfetto" else "messages"])
 
 
+@pytest.mark.thorough
 def test_files_are_written_whole_and_counted(run: Path) -> None:
     count = export(run, "mcap")
     assert export(run, "rosbag2") == count

@@ -59,6 +59,7 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
     assert str(tmp_path / "out" / "gantt.png") in shown.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_rows_of_a_large_rack_are_not_wrapped_and_its_times_are_written_in_full(
     tmp_path: Path,

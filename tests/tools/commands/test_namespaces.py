@@ -65,6 +65,7 @@ def find_row(listed: SimpleNamespace, name: str) -> dict[str, object]:
     return next(row for row in json.loads(listed.stdout) if row["rack"] == name)
 
 
+@pytest.mark.thorough
 def test_a_running_rack_is_listed_as_running_never_cleaned_and_can_be_stopped(
     held: subprocess.Popen[bytes], rack_name: str, tmp_path: Path
 ) -> None:

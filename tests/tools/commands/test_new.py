@@ -58,11 +58,12 @@ def test_the_written_files_run(kind: str, name: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     # A planner comes with an executor.
-    [("planner",), pytest.param(KINDS, marks=pytest.mark.thorough)],
+    [("planner",), KINDS],
     ids=["planner", "all"],
 )
 def test_the_written_files_pass_their_tests(

@@ -16,6 +16,7 @@ NO_DRIVER = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_first_view_and_one_of_its_views_are_drawn(run: Path, tmp_path: Path) -> None:
     # A run of a flight recorder has no run.rrd.

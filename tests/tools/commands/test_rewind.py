@@ -159,6 +159,7 @@ def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.thorough
 def test_a_branch_may_begin_while_a_cycle_is_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,7 @@ CRASHES = (
 LATE = "level 'lower' missed 0 and skipped 120 of its 120 cycles (100 %; at most 5 % permitted)"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_failed_run_has_the_same_verdict_everywhere(
     small: Path, rack_name: str, tmp_path: Path

@@ -185,6 +185,7 @@ def test_the_query_of_the_page_finds_the_cycle_3_s_before_a_miss(recording: Reco
         assert trace.query("select * from stats where severity = 'error' and value > 0") == []
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_perfetto_reads_a_whole_run(tmp_path_factory: pytest.TempPathFactory) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))

@@ -21,6 +21,7 @@ def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.Com
     return rack("run", config, "--set", f"name={name}", *arguments)
 
 
+@pytest.mark.thorough
 def test_a_run_with_a_script_repeats_with_its_faults(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:

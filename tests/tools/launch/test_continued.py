@@ -168,6 +168,7 @@ def test_a_run_in_an_outage_has_no_state_and_the_time_is_refused(
     assert read_report(second)["digest"] == read_report(recorded)["digest"]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_state_that_differs_from_the_recording_is_noted(recorded: Path, folder: Path) -> None:
     levels = folder / "changing_levels.py"
@@ -223,6 +224,7 @@ def test_a_folder_that_is_not_a_run_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_run_of_an_older_version_needs_the_option_anyway(run: Path) -> None:
     code = run / "code.json"

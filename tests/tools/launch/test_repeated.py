@@ -26,6 +26,8 @@ from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.tools.command_line import rack
 
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+
 SECONDS = 0.8
 HOLD = "level = 'upper', what = 'hold', tick = 40"
 NAMED = """
@@ -146,12 +148,10 @@ def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     )
 
 
-@pytest.mark.slow
 def test_an_operators_command_is_not_mistaken_for_one_of_the_config(in_lockstep: Recording) -> None:
     assert load_operator_commands(in_lockstep) == requests(in_lockstep.rack_config, *GIVEN)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("at", "ticks"), [(0.0, [20, 30, 40, 80, 200]), (0.3025, [200])])
 def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
@@ -163,7 +163,6 @@ def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     assert set(two.read_signal("upper.status", "reason").tolist()) == {f"rack command {name}"}
 
 
-@pytest.mark.slow
 def test_a_repeated_run_without_the_commands_differs(
     in_lockstep: Recording, tmp_path: Path
 ) -> None:
@@ -176,7 +175,6 @@ def test_a_repeated_run_without_the_commands_differs(
     assert difference.tick == GIVEN[0][1]
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
     rack_name: str, tmp_path: Path
@@ -210,14 +208,12 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return one
 
 
-@pytest.mark.slow
 def test_a_run_continues_after_the_last_command_of_its_operators(
     by_hand: Recording, tmp_path: Path
 ) -> None:
     check_repetition(by_hand, continued(by_hand, 0.7, tmp_path / "two"), [])
 
 
-@pytest.mark.slow
 def test_a_command_that_waits_in_a_snapshot_is_issued_once(
     by_hand: Recording, tmp_path: Path
 ) -> None:
@@ -227,7 +223,6 @@ def test_a_command_that_waits_in_a_snapshot_is_issued_once(
     check_repetition(two, continued(two, 0.6, tmp_path / "three"), [260])
 
 
-@pytest.mark.slow
 def test_a_branch_adds_its_commands_to_the_repeated_ones(
     by_hand: Recording, tmp_path: Path
 ) -> None:
@@ -236,7 +231,6 @@ def test_a_branch_adds_its_commands_to_the_repeated_ones(
     assert two.read_signal("upper.operator", "tick").tolist() == [140, 200, 260]
 
 
-@pytest.mark.slow
 def test_commands_in_a_flight_recorder_are_repeated_to_the_end_of_a_stretch(
     by_hand: Recording,
 ) -> None:

@@ -203,6 +203,7 @@ def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
     assert rack("set", running, "board.lower.params.by=1").returncode == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
     commanded: Path, rack_name: str

@@ -66,6 +66,7 @@ async def write(pilot: Pilot[None], text: str) -> None:
     await pilot.press("enter")
 
 
+@pytest.mark.thorough
 def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> None:
     async def act(pilot: Pilot[None]) -> None:
         await shows(pilot, running, "upper", "lower", "missed", "late ms", "executing")

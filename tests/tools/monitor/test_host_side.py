@@ -65,6 +65,7 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     hosted: Path, rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]

@@ -111,6 +111,7 @@ def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> No
     assert unknown["frequency_mhz"] is None
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_recording_keeps_what_the_machine_did(
     small: Path, tmp_path: Path, rack_name: str

@@ -116,7 +116,11 @@ def measured_run(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("measured_run", ["realtime", "lockstep"], indirect=True)
+@pytest.mark.parametrize(
+    "measured_run",
+    [pytest.param("realtime", marks=pytest.mark.thorough), "lockstep"],
+    indirect=True,
+)
 def test_measured_times_match_known_computing_times(measured_run: Recording) -> None:
     # Use the median, so that a host that takes the machine away does not fail this test.
     found = measure_budgets(measured_run, 50.0)["level"]

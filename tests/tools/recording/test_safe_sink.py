@@ -102,7 +102,7 @@ def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
         ("HURRIED_TIMEOUT_S", 0.05, True),
         ("OPENING_TIMEOUT_S", 0.05, False),
         # The recorder does not wait if opening uses no processor time.
-        pytest.param("CHECK_PERIOD_S", 0.02, False, marks=pytest.mark.slow),
+        pytest.param("CHECK_PERIOD_S", 0.02, False, marks=[pytest.mark.slow, pytest.mark.thorough]),
     ],
 )
 def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(

@@ -164,6 +164,7 @@ def _losing(run: Recording) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_equal_runs_have_no_chain(runs: Runs, tmp_path: Path) -> None:
     one = runs.one
     again = Recording(Path(shutil.copytree(one.folder, tmp_path / "again")))
@@ -185,6 +186,7 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(runs: Runs) ->
     assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
 
 
+@pytest.mark.thorough
 def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     runs: Runs, tmp_path: Path
 ) -> None:
@@ -228,6 +230,7 @@ def test_a_fault_is_the_cause_and_nothing_is_repeated(
         assert away[0]["unequal"] == "wave.status"
 
 
+@pytest.mark.thorough
 def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> None:
     level = tmp_path / "summing_levels.py"
     text = SUMMING.format(folder=tmp_path, module=level.stem)

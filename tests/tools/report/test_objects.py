@@ -71,6 +71,7 @@ def test_a_goal_for_an_object_outside_the_scene_is_a_mistake() -> None:
     assert found.startswith(f'scene.goal[0].object = "block9": {why}')
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_an_object_released_in_the_air_is_reported_with_its_fall(
     rack_name: str, tmp_path: Path

@@ -59,7 +59,7 @@ def test_the_viewer_has_a_lane_of_active_copies(
     [
         pytest.param(LOWER_LOST_AT - 1, marks=pytest.mark.thorough),
         LOWER_LOST_AT + 40,
-        CLOCK_LOST_AT + 40,
+        pytest.param(CLOCK_LOST_AT + 40, marks=pytest.mark.thorough),
     ],
 )
 def test_a_run_continues_a_run_with_hand_overs_to_its_digest(

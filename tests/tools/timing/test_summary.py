@@ -63,7 +63,10 @@ def test_a_rack_that_does_not_fit_shows_failures_and_helpful_changes(small: Path
         # Its rate is in Hz, which excludes a period in ticks.
         ("nasrem", "--set", "board.primitive.budget.process_ms=15"),
         # Two boards need a change, and one of them another core.
-        ("nasrem", "--set", "board.world.budget.process_ms=21", "--set", "board.servo.core=0"),
+        pytest.param(
+            ("nasrem", "--set", "board.world.budget.process_ms=21", "--set", "board.servo.core=0"),
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_each_printed_fix_makes_the_rack_fit_when_it_is_pasted(words: tuple[str, ...]) -> None:

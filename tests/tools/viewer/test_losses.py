@@ -57,6 +57,7 @@ def list_spans(rows: EntityRows, states: Iterable[str]) -> list[tuple[int, int]]
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_dead_and_a_hanging_board_are_lost_until_they_return(file: Path) -> None:
     events = read_component(file, "/log/events", "TextLog:text").values.ravel().tolist()

@@ -138,6 +138,7 @@ def branched_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     branched_runs: Path,
@@ -159,10 +160,9 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "view", [None, pytest.param("log of all runs", marks=pytest.mark.thorough)]
-)
+@pytest.mark.parametrize("view", [None, "log of all runs"])
 def test_no_view_of_a_branch_and_its_run_fails_in_the_viewer(
     branched_runs: Path, view: str | None
 ) -> None:

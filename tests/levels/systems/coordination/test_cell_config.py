@@ -96,6 +96,7 @@ BY = 9.0
 REACH = {"arm": "puma", "do": "goto", "position": [0.45, 0.10, 0.95], "by": BY}
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_order_is_done_in_time_whichever_board_is_killed(rack_name: str) -> None:
     config = load("nasrem", [f"name={rack_name}", *ORDERED])

@@ -144,6 +144,7 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
         assert hoist.status.touches == hoist.status.violations == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
@@ -176,7 +177,7 @@ def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("restarted", ["alpha", "beta"])
+@pytest.mark.parametrize("restarted", ["alpha", pytest.param("beta", marks=pytest.mark.thorough)])
 def test_the_part_stays_in_place_during_a_restart(pair: Pair, restarted: str) -> None:
     pair.lift(pair.alpha)
     hoist: Hoist = getattr(pair, restarted)

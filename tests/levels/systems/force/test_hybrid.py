@@ -167,7 +167,7 @@ def test_a_force_settles_is_kept_along_a_motion_and_ends_without_a_step(tmp_path
     assert 1e-3 < np.abs(away).max() < 0.1
 
 
-@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("axis", [1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
     guard = np.zeros(6)
     guard[axis] = 8.0
@@ -202,6 +202,7 @@ def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
     assert rig.force.reason == ""
 
 
+@pytest.mark.thorough
 def test_force_axes_rest_while_wrench_or_commands_are_missing(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     silent = "no wrench from the board of the arm: waiting for it"
@@ -245,6 +246,7 @@ def test_a_bad_command_is_refused(tmp_path: Path, field: str, value: Sequence[fl
     assert not rig.status.holding
 
 
+@pytest.mark.thorough
 def test_after_restart_and_brakes_motion_begins_where_the_arm_is(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     rig.rack.lose("hybrid", ticks=100)

@@ -139,6 +139,7 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
     assert (verdict(again), again.start, again.is_cut) == (verdict(whole), continued.start, True)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
     later = ((520, "upper.command"), (700, "lower.status"), (1000, "upper.command"))
@@ -169,6 +170,7 @@ def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
     assert (whole.begin_ticks, judge_trial(whole).actual_plan) == ((), actual)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_faultless_rack_runs_only_as_far_as_necessary_and_equals_one_without_snapshots(
     bench: Bench,

@@ -47,6 +47,7 @@ def test_each_trial_leaves_a_file_and_no_process_stays(config: RackConfig, tmp_p
     assert not active_children()
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings(FORKS)
 def test_workers_end_with_a_campaign_that_is_killed(config: RackConfig, tmp_path: Path) -> None:
     endless = replace(job(tmp_path, 5), seconds=1e6)
@@ -63,6 +64,7 @@ def test_workers_end_with_a_campaign_that_is_killed(config: RackConfig, tmp_path
         wait_until(lambda: not any(map(is_alive, family)))
 
 
+@pytest.mark.thorough
 def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -74,6 +76,7 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
         list(workers.run([bad], alone=False))
 
 
+@pytest.mark.thorough
 def test_a_worker_that_was_killed_ends_the_campaign_with_its_reason(
     config: RackConfig, tmp_path: Path
 ) -> None:

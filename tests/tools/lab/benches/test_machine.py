@@ -107,6 +107,7 @@ def test_the_verdict_comes_first_with_the_highest_rate_and_the_reason() -> None:
     assert [one["held"] for one in document["rates"]] == [True, False]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
     waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

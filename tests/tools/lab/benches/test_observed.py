@@ -37,6 +37,7 @@ def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them() -> 
     assert compute_lateness_us(Overslept(), "board1").tolist() == [100.0, 5100.0]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     chain = Chain(2, 400, "lockstep")

@@ -27,6 +27,7 @@ def test_a_wake_up_outside_the_planners_time_does_not_count_as_a_switch() -> Non
         compute_switch_times_us(gaps[1:], awake[1:])
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @needs_fifo
 @needs_two_cores
