@@ -3,9 +3,9 @@ takes an hour.
 
 Each mutant is a copy of the tree with one random change in one file: a comparison flipped, a
 statement dropped, a number greater, `and` for `or`, a condition negated, a sign. The tests that
-mirror the file must fail on it. What no test is to notice is not changed: annotations, messages,
-numbers of enumeration members, lengths of time-outs, when garbage is collected, `strict` of `zip`,
-and how a picture is drawn (`plot.py`).
+mirror the file must fail on it, or the digest of a shipped rack must change. What no test is to
+notice is not changed: annotations, messages, numbers of enumeration members, lengths of time-outs,
+when garbage is collected, `strict` of `zip`, and how a picture is drawn (`plot.py`).
 
 A test that fails on the unchanged copy as well kills nothing: it is left out, and the mutant is
 examined again. Tests marked `alone` are left out too: they judge the machine.
@@ -40,6 +40,8 @@ PACKAGES = ("backplane", "boards", "levels", "tools")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 FEW = 8
 """Files of tests for one mutant, at most, besides its mirrored folder."""
+GOLDEN = "tests/test_golden.py"
+"""Whole runs of shipped racks: their digests change with what any board or level writes."""
 QUICK = "not alone and not slow and not thorough"
 SLOW = "not alone and (slow or thorough)"
 BOUND_S, TEST_BOUND_S = 900, 60
@@ -347,8 +349,9 @@ def _clear(run: subprocess.Popen[bytes], folder: Path) -> None:
         with suppress(OSError):
             if mark in path.read_bytes().split(b"\0") and runs(int(path.parent.name)):
                 os.kill(int(path.parent.name), signal.SIGKILL)
-    for left in Path("/dev/shm").glob(f"*nasrem-rack.test-{run.pid}-*"):
-        left.unlink(missing_ok=True)
+    for pattern in (f"*nasrem-rack.*-{run.pid}", f"*nasrem-rack.*-{run.pid}-*"):
+        for left in Path("/dev/shm").glob(pattern):
+            left.unlink(missing_ok=True)
 
 
 def _kill(session: int) -> None:
@@ -374,6 +377,8 @@ class Bench:
 
     def _examined_by(self, marks: str, mutation: Mutation) -> str:
         tests, left_out = mirrors(mutation.file), set[str]()
+        if marks == SLOW and not mutation.file.startswith("tools/") and GOLDEN not in tests:
+            tests = [*tests, GOLDEN]
         # One path for all copies: code that is compiled is kept by it.
         self._copy([mutation.patch()])
         while True:
