@@ -197,11 +197,9 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 @pytest.fixture
-def small(tmp_path: Path) -> Path:
+def small(write: Callable[[str, str], Path]) -> Path:
     """A rack of two levels that count, as a file."""
-    path = tmp_path / "small.toml"
-    path.write_text(SMALL)
-    return path
+    return write("small.toml", SMALL)
 
 
 @pytest.fixture

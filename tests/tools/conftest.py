@@ -29,11 +29,9 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 
 @pytest.fixture
-def commanded(tmp_path: Path) -> Path:
+def commanded(write: Callable[[str, str], Path]) -> Path:
     """A rack whose levels take commands of operators, as a file."""
-    path = tmp_path / "commanded.toml"
-    path.write_text(COMMANDED)
-    return path
+    return write("commanded.toml", COMMANDED)
 
 
 @pytest.fixture

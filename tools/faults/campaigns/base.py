@@ -81,7 +81,7 @@ class BaseRack:
         Args:
             crate: Crate of the worker, which keeps the snapshots.
             seconds: Simulated time in s after which the run ends. None to run until the task ends.
-            cores: Cores on which the boards may run. None for those of this object.
+            cores: Cores on which the boards may run. None for those given to the constructor.
         """
         if self._crate is not crate:
             self._crate = crate

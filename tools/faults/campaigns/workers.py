@@ -161,7 +161,7 @@ class TrialRunner:
         self._prepare_crate(lockstep=True)
 
     def prepare_base(self) -> None:
-        """Take the first snapshot of the faultless rack, from which most trials continue."""
+        """Take the first snapshot of the faultless rack, before any trial needs one."""
         crate = self._prepare_crate(lockstep=True)
         if crate is not None and not self._whole:
             self._base.run_to_snapshot(crate)
