@@ -56,6 +56,7 @@ class CyclesFile:
 
     def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
+        self._waiting_rows = 0
         metadata = {
             "layout": encode_json(asdict(layout)),
             "launch": encode_json(launch),
@@ -73,7 +74,8 @@ class CyclesFile:
         """Add trace records of a task, shape (rows,)."""
         if len(rows):
             self._waiting.append((task, rows))
-        if sum(len(block) for _, block in self._waiting) >= TRACE_ROWS:
+            self._waiting_rows += len(rows)
+        if self._waiting_rows >= TRACE_ROWS:
             self._write_block()
 
     def _write_block(self) -> None:
@@ -89,6 +91,7 @@ class CyclesFile:
             pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
         )
         self._waiting = []
+        self._waiting_rows = 0
 
     def close(
         self,
@@ -141,6 +144,7 @@ class SignalTable:
         self._tick_s = layout.clock_ns * 1e-9
         self._columns = list_columns(mailbox)
         self._waiting: list[np.ndarray] = []
+        self._waiting_rows = 0
         head = [
             pa.field(TIME_COLUMN, pa.float64(), metadata={"unit": "s"}),
             *(
@@ -168,10 +172,8 @@ class SignalTable:
     def add_rows(self, rows: np.ndarray) -> None:
         """Add rows of the mailbox's ring, at least one, shape (rows,)."""
         self._waiting.append(rows)
-        if (
-            sum(map(len, self._waiting)) >= MESSAGE_ROWS
-            or sum(block.nbytes for block in self._waiting) >= MESSAGE_BYTES
-        ):
+        self._waiting_rows += len(rows)
+        if self._waiting_rows >= min(MESSAGE_ROWS, MESSAGE_BYTES // rows.itemsize):
             self._write_block()
 
     def _write_block(self) -> None:
@@ -180,6 +182,7 @@ class SignalTable:
             return
         rows = np.concatenate(self._waiting)
         self._waiting = []
+        self._waiting_rows = 0
         head = [np.ascontiguousarray(rows[name]) for name in HEAD_COLUMNS]
         time_s = pa.array(rows["tick"] * self._tick_s)
         arrays = [column.to_arrow(rows["message"]) for column in self._columns]
