@@ -1,7 +1,7 @@
-"""Measures stolen time and frequency of the machine's cores during a run.
+"""Measures the stolen time of the machine's cores during a run.
 
 Steal is time for which the hypervisor withheld a core that this machine needed; /proc/stat counts
-it for each core. A core at a lower frequency computes more slowly; /proc/cpuinfo shows it.
+it for each core. The cores' frequency is not read: the kernel interrupts every core for it.
 """
 
 from __future__ import annotations
@@ -9,21 +9,13 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 STAT = Path("/proc/stat")
-CPUINFO = Path("/proc/cpuinfo")
 STEAL_COLUMN = 8
 """Column of the steal count in a core's line of /proc/stat."""
-FREQUENCY_S = 0.5
-"""Time between two readings of the frequency.
-
-Some kernels interrupt every core to read it, so it is not read more often.
-"""
 _MS = 1000 // os.sysconf("SC_CLK_TCK")
 
 
@@ -46,12 +38,10 @@ class CoreRecord:
     Attributes:
         lasted_ns: Duration of the measurement.
         stolen: Increases of steal, earliest first, or None if steal was not measured.
-        mhz: (core, lowest MHz, highest MHz) for each core with a known frequency.
     """
 
     lasted_ns: int = 0
     stolen: tuple[Stolen, ...] | None = None
-    mhz: tuple[tuple[int, float, float], ...] = ()
 
 
 UNMEASURED = CoreRecord()
@@ -59,17 +49,15 @@ UNMEASURED = CoreRecord()
 
 
 class CoreMeter:
-    """Measures steal and frequency of the cores by reading the kernel's counters repeatedly."""
+    """Measures the steal of the cores by reading the kernel's counters repeatedly."""
 
     def __init__(self) -> None:
         self._stolen: list[Stolen] = []
-        self._mhz: dict[int, tuple[float, float]] = {}
         self._counts = _read_steal()
         self._began_ns = self._looked_ns = time.monotonic_ns()
-        self._frequency_at = 0.0
 
     def read_counters(self) -> None:
-        """Read the counters, and update the stolen times and the frequency range of each core."""
+        """Read the counters, and update the stolen times."""
         counts = _read_steal()
         now = time.monotonic_ns()
         if counts != self._counts:
@@ -81,17 +69,11 @@ class CoreMeter:
             ]
         self._counts = counts
         self._looked_ns = now
-        if time.monotonic() >= self._frequency_at:
-            self._frequency_at = time.monotonic() + FREQUENCY_S
-            for core, mhz in _read_frequencies():
-                low, high = self._mhz.get(core, (mhz, mhz))
-                self._mhz[core] = min(low, mhz), max(high, mhz)
 
     def build_record(self) -> CoreRecord:
         """Return all measurements from the start to the last reading as a record."""
-        mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
         return CoreRecord(
-            self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz
+            self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None
         )
 
 
@@ -103,14 +85,3 @@ def _read_steal() -> dict[int, int]:
         for line in lines
         if re.fullmatch(r"cpu\d+", line[0]) and len(line) > STEAL_COLUMN
     }
-
-
-def _read_frequencies() -> Iterator[tuple[int, float]]:
-    """Yield (core, MHz) for every core whose frequency the kernel reports."""
-    for block in CPUINFO.read_text().split("\n\n"):
-        fields = {
-            name.strip(): value
-            for name, _, value in (line.partition(":") for line in block.splitlines())
-        }
-        with suppress(KeyError, ValueError):
-            yield int(fields["processor"]), float(fields["cpu MHz"])

@@ -17,7 +17,6 @@ import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import LATE_DIVISOR
-from rack.backplane.trace import Flag
 from rack.boards.config.layout import find_core
 from rack.boards.timing.trace_times import (
     STAMPS,
@@ -27,19 +26,6 @@ from rack.boards.timing.trace_times import (
 )
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
-
-QUOTA_NS = 100_000_000
-"""Period of CPU quotas: default of Linux (cpu.max), used by libvirt, Docker and Kubernetes."""
-MIN_STALLS = 5
-CLUSTERED_PART = 0.75
-WINDOW_PART = 0.02
-"""Thresholds of the quota test: number of stalls, their share in one window, and its width.
-
-The width is a fraction of the quota period. If the phases are independent of the period, four of
-five stalls end within 2 % of it in one of 6,300 runs, and more rarely with more stalls. A share of
-three quarters is enough to exclude most levels that are late for other reasons: the stalls of a
-level whose cycle is half the period end at two phases.
-"""
 
 
 @dataclass(frozen=True)
@@ -60,22 +46,6 @@ class Absence:
 
 
 @dataclass(frozen=True)
-class Quota:
-    """Stalls that end at the same phase of `QUOTA_NS`, which points to a CPU quota.
-
-    Attributes:
-        together: Number of stalls that end at that phase.
-        stalls: Number of all stalls.
-        levels: Levels that may be the cause instead, because their period is a multiple of
-            `QUOTA_NS`.
-    """
-
-    together: int
-    stalls: int
-    levels: list[str]
-
-
-@dataclass(frozen=True)
 class Stalls:
     """Lost cycles of a run, which were late or skipped, and the absences of cores.
 
@@ -83,13 +53,11 @@ class Stalls:
         lost: Number of all lost cycles.
         during_steal: Number of lost cycles that were due while the steal of their core increased.
         absences: One summary for each core that was absent without steal.
-        quota: The suspected quota, or None.
     """
 
     lost: int
     during_steal: int
     absences: list[Absence]
-    quota: Quota | None
 
 
 def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
@@ -127,13 +95,7 @@ def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]
             absences.append(Absence(core, len(durations_ns), int(durations_ns.max()) / 1e6, lost))
         during_steal += cycles.count_lost_during(stolen, on_core)
         absent_spans[core] = Occupation.merge([stolen, unstolen, without_clock])
-    levels_ns = {
-        task.name: task.every * cycles.grid_ns
-        for task in recording.layout.tasks
-        if task.role == "executor"
-    }
-    quota = _detect_quota(cycles.find_stall_ends(), levels_ns)
-    return Stalls(int(cycles.lost.sum()), during_steal, absences, quota), absent_spans
+    return Stalls(int(cycles.lost.sum()), during_steal, absences), absent_spans
 
 
 class _CycleTable:
@@ -182,15 +144,6 @@ class _CycleTable:
         is_hit = occupied.compute_overlap(self.due_ns, self.resumed_ns) > 0
         return int(self.lost[among & is_hit].sum())
 
-    def find_stall_ends(self) -> np.ndarray:
-        """Return the end times of stalls. A stall is a period in which executors lost cycles.
-
-        Overlapping delays of cycles count as one stall, even on different cores.
-        """
-        # Planners are left out, because their time slice may be longer than a stall.
-        counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
-        return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
-
     def find_clock_absences(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
         """Find the due and the actual time of each late wake-up of the clock board.
 
@@ -228,33 +181,3 @@ class _CycleTable:
         # A span begins no earlier than the last stamp on the core before the cycle. For the
         # first cycle, index -1 selects the last stamp of the run, so its span is empty.
         return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
-
-
-def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
-    """Return the CPU quota that stalls indicate, or None if too few end at the same phase.
-
-    Args:
-        ends: Times at which stalls ended, from `find_stall_ends`.
-        periods_ns: Dictionary from level to its period.
-    """
-    if len(ends) < MIN_STALLS or (
-        at_one_phase := _count_at_one_phase(ends, QUOTA_NS)
-    ) < CLUSTERED_PART * len(ends):
-        return None
-    levels = [
-        name
-        for name, ns in periods_ns.items()
-        if not ns % QUOTA_NS and _count_at_one_phase(ends, ns) >= at_one_phase
-    ]
-    return Quota(at_one_phase, len(ends), levels)
-
-
-def _count_at_one_phase(ends: np.ndarray, period_ns: int) -> int:
-    """Return the largest number of end times that have about the same phase in a period.
-
-    Their phases lie within a window whose width is `WINDOW_PART` times `QUOTA_NS`.
-    """
-    phases = np.sort(ends % period_ns)
-    around = np.append(phases, phases + period_ns)
-    following = np.searchsorted(around, phases + WINDOW_PART * QUOTA_NS, side="right")
-    return int((following - np.arange(len(phases))).max())

@@ -111,10 +111,6 @@ def build_report(recording: Recording) -> Document:
         misses=add_causes(recording, missed_cycles, absent),
         steal=summarize_steal(recording),
         stalls=asdict(stalls),
-        frequency_mhz={
-            str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz
-        }
-        or None,
         notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
         holds=list_holds(recording),
         state_tables=list_fired_rows(recording),

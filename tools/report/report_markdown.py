@@ -32,8 +32,6 @@ DROPPED = (
 """Columns that a narrow terminal leaves out, in this order."""
 NOT_TABULATED = "levels", "beyond", "count", "parts", "uncertainty_ms"
 """Keys of a measured response that have no column."""
-CHANGED_RATIO = 1.05
-"""Ratio of a core's highest to its lowest frequency above which the text mentions the core."""
 
 
 def format_markdown(report: Document) -> str:
@@ -129,7 +127,7 @@ def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 
 def _format_machine(report: RunReport) -> Iterator[str]:
-    """Yield notes on times when a core was unavailable, and on changes of the core frequencies."""
+    """Yield notes on times when a core was unavailable."""
     steal, stalls = report.steal, report.stalls
     lost = f"of {stalls['lost']} lost cycles were due at these times"
     if steal["ms"]:
@@ -140,19 +138,6 @@ def _format_machine(report: RunReport) -> Iterator[str]:
             f"- core {away['core']} was away although no steal was counted (stalls:"
             f" {away['times']}, longest {away['longest_ms']:.3g} ms); {away['lost']} {lost}"
         )
-    if quota := stalls["quota"]:
-        causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
-        yield (
-            f"- {quota['together']} of {quota['stalls']} stalls end at the same phase of a 100 ms"
-            f" period, which suggests {' or '.join(causes)}"
-        )
-    changed = [
-        f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz"
-        for core, mhz in (report.frequency_mhz or {}).items()
-        if mhz["max"] > CHANGED_RATIO * mhz["min"]
-    ]
-    if changed:
-        yield f"- the processor changed its frequency: {', '.join(changed)}"
 
 
 def format_comparison(against: Document) -> Iterator[str]:

@@ -50,7 +50,6 @@ class RunReport:
     misses: Any = None
     steal: Any = None
     stalls: Any = None
-    frequency_mhz: Any = None
     notes: Any = None
     holds: Any = None
     state_tables: Any = None

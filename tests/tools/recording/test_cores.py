@@ -1,9 +1,8 @@
-"""Measurements of the cores during a run: steal, misses meanwhile, and frequencies."""
+"""Measurements of the cores during a run: steal, and misses meanwhile."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,13 +23,8 @@ S = 1_000_000_000
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine of two cores, as its files in a folder; it shows no frequencies yet."""
+    """A machine of two cores, as its file of counters in a folder."""
     monkeypatch.setattr(cores, "STAT", tmp_path / "stat")
-    monkeypatch.setattr(cores, "CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(cores, "FREQUENCY_S", 0.0)
-    (tmp_path / "cpuinfo").write_text(
-        "processor\t: 0\nflags\t: fpu\n\nprocessor\t: 1\nflags\t: fpu\n"
-    )
     steal(tmp_path, 3, 7)
     return tmp_path
 
@@ -53,16 +47,6 @@ def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) 
     assert (stolen.core, stolen.ms) == (1, 20)
     assert stolen.from_ns < stolen.to_ns
     assert record.lasted_ns > 0
-
-
-def test_the_range_of_each_cores_frequency_is_measured(machine: Path) -> None:
-    found = CoreMeter()
-    for mhz in ("2600.000", "1200.5"):
-        (machine / "cpuinfo").write_text(
-            f"processor\t: 0\ncpu MHz\t\t: {mhz}\n\nprocessor\t: 1\ncpu MHz\t\t: 900\n"
-        )
-        found.read_counters()
-    assert found.build_record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
@@ -95,20 +79,11 @@ def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path:
 
 
 def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> None:
-    def report(*mhz: tuple[int, float, float]) -> dict[str, Any]:
-        return build_report(run(tmp_path / "run", small, CoreRecord(S, (), mhz)))
-
-    quiet = report((0, 2600.0, 2600.0), (1, 2600.0, 2650.0))
+    quiet = build_report(run(tmp_path / "run", small, CoreRecord(S, ())))
     assert quiet["steal"]["measured"]
-    assert quiet["frequency_mhz"]["1"] == {"min": 2600.0, "max": 2650.0}
-    assert not {"hypervisor", "frequency"} & set(format_markdown(quiet).split())
-    slow = report((0, 800.0, 2600.0), (1, 2600.0, 2600.0))
-    assert "- the processor changed its frequency: core 0 800 to 2600 MHz\n" in format_markdown(
-        slow
-    )
+    assert "hypervisor" not in format_markdown(quiet)
     unknown = build_report(run(tmp_path / "run", small, UNMEASURED))
     assert not unknown["steal"]["measured"]
-    assert unknown["frequency_mhz"] is None
 
 
 @pytest.mark.thorough

@@ -1,11 +1,10 @@
-"""Causes of lost cycles: steal, absences without steal, and quotas. None enters a budget."""
+"""Causes of lost cycles: steal, and absences without steal. None enters a budget."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
@@ -14,7 +13,7 @@ from rack.boards.config.layout import find_core
 from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.recording.cycles import measure_budgets, read_cycles
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.stalls import Absence, Quota, Stalls, analyze_stalls
+from rack.tools.recording.stalls import Absence, Stalls, analyze_stalls
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import build_report
 from rack.tools.report.report_markdown import format_markdown
@@ -41,11 +40,6 @@ def config(small: Path) -> RackConfig:
 def skipping(count: int) -> int:
     """Return the flags of a cycle before which `count` releases were skipped."""
     return count << SKIPPED_SHIFT | int(Flag.SKIPPED)
-
-
-def resumed_at(end_ms: float, skips: int = 2) -> Cycle:
-    """Return the first cycle after a stall that ended at `end_ms` and cost `skips` releases."""
-    return Cycle(int(end_ms // TICK_MS), PLAIN, late=end_ms % TICK_MS, flags=skipping(skips))
 
 
 def plain_cycles(first: int, last: int) -> list[Cycle]:
@@ -97,50 +91,6 @@ def test_skipped_cycles_are_attributed_to_steal_of_their_core(
     recording.cores = CoreRecord(100 * MS, (Stolen(0, 50 * MS, OTHER, 10),))
     line = f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due at these"
     assert line in format_markdown(build_report(recording))
-
-
-def test_stalls_that_end_at_the_same_phase_suggest_a_quota(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    jitter = np.random.default_rng(3).uniform(0, 1.5, 11)
-    ends = [*(100.0 * k + 31.2 + jitter[k] for k in range(11)), 1260.0, 1388.0]
-    recording = run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]})
-    assert find_stalls(recording).quota == Quota(together=11, stalls=13, levels=[])
-    report = build_report(recording)
-    assert report["stalls"]["quota"] == {"together": 11, "stalls": 13, "levels": []}
-    line = (
-        "- 11 of 13 stalls end at the same phase of a 100 ms period, which suggests a quota of the"
-        " host\n"
-    )
-    assert line in format_markdown(report)
-
-
-def test_overlapping_losses_count_as_one_stall(config: RackConfig, tmp_path: Path) -> None:
-    ends = [100.0 * k + 31.2 for k in range(1, 7)]
-    upper = [Cycle(int((end - 15) // TICK_MS), PLAIN, late=15.4, flags=MISSED) for end in ends]
-    # The stall begins within a cycle, which is late. The next cycles are skipped.
-    struck = [Cycle(int(end // TICK_MS) - 3, (0.0, 0.1, 7.2, 0.1), flags=MISSED) for end in ends]
-    both = [cycle for pair in zip(struck, map(resumed_at, ends), strict=True) for cycle in pair]
-    found = find_stalls(run(tmp_path / "run", config, {"upper": upper, "lower": both}))
-    assert found.lost == 6 * 4
-    assert found.quota == Quota(together=6, stalls=6, levels=[])
-
-
-def test_a_level_with_the_period_of_the_stalls_is_a_possible_cause(
-    small: Path, tmp_path: Path
-) -> None:
-    config = load(small, ["clock.mode=realtime", "board.upper.rate_hz=5"])
-    beyond = [resumed_at(200.0 * k + 31.2) for k in range(6)]
-    recording = run(tmp_path / "run", config, {"lower": beyond})
-    assert find_stalls(recording).quota == Quota(together=6, stalls=6, levels=["upper"])
-    line = (
-        "- 6 of 6 stalls end at the same phase of a 100 ms period, which suggests the cycle of"
-        " upper or a quota of the host\n"
-    )
-    assert line in format_markdown(build_report(recording))
-    # With another phase of the quota, the ends lie at two phases of the level.
-    either = [resumed_at(100.0 * k + 31.2) for k in range(6)]
-    assert find_stalls(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
 
 
 def absence_trace() -> dict[str, list[Cycle]]:
@@ -206,7 +156,7 @@ def test_cycles_lost_to_a_late_clock_are_attributed_to_the_clocks_core(
 def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
     long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
     recording = run(tmp_path / "run", load(small), absence_trace() | long)
-    assert find_stalls(recording) == Stalls(2, 0, [], None)
+    assert find_stalls(recording) == Stalls(2, 0, [])
     assert [cycles.stalled_count for cycles in read_cycles(recording).values()] == [0, 0]
 
 
