@@ -32,11 +32,8 @@ import numpy as np
 
 DIGEST_BYTES = 16
 """Length of a digest, in bytes."""
-CACHE_HINT = "set XDG_CACHE_HOME to a folder that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
-_A = ParamSpec("_A")
-_T = TypeVar("_T")
 
 
 on_compile: Callable[[str], object] | None = None
@@ -76,8 +73,30 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         return self._machine
 
     def _build(self) -> Any:
-        """Return numba's version of this function, which other compiled functions call."""
-        return _compile_function(self)
+        """Return numba's version of this function, which calls that of other marked functions."""
+        from numba import config, njit
+
+        # NUMBA_DISABLE_JIT is meant for users' functions. These functions need compilation, because
+        # they call C functions by address.
+        # numba creates the attribute at run time.
+        config.DISABLE_JIT = 0  # type: ignore[attr-defined]
+        function: Any = self._function
+        known = function.__globals__
+        called = {
+            name: known[name].load_machine_code()
+            for name in function.__code__.co_names
+            if isinstance(known.get(name), compiled)
+        }
+        bound = FunctionType(
+            function.__code__, known | called, function.__name__, function.__defaults__
+        )
+        bound.__module__ = function.__module__
+        bound.__qualname__ = function.__qualname__
+        machine = njit(error_model="numpy")(bound)
+        name = f"{function.__module__}.{function.__qualname__}"
+        # numba creates the attribute at run time.
+        machine._cache = _CodeCache(name, _compute_digest(b"".join(self.iterate_source())))  # type: ignore[attr-defined]
+        return machine
 
     def preload(self) -> None:
         """Load the machine code for the types given in `compiled_for`, if any."""
@@ -140,7 +159,7 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
 
 def compiled_for(
     types: str, records: np.dtype[Any] | None = None
-) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
+) -> Callable[[Callable[_P, _R]], compiled[_P, _R]]:
     """Return a decorator that marks a function for compilation before a run, for given types.
 
     Args:
@@ -158,33 +177,6 @@ def preload(*modules: ModuleType) -> None:
         for function in [*vars(module).values()]:
             if isinstance(function, compiled):
                 function.preload()
-
-
-def _compile_function(marked: compiled[..., Any]) -> Any:
-    """Compile a marked function, so that it calls the compiled form of other marked functions."""
-    from numba import config, njit
-
-    # NUMBA_DISABLE_JIT is meant for users' functions. These functions need compilation, because
-    # they call C functions by address.
-    # numba creates the attribute at run time.
-    config.DISABLE_JIT = 0  # type: ignore[attr-defined]
-    function: Any = marked._function
-    known = function.__globals__
-    called = {
-        name: known[name].load_machine_code()
-        for name in function.__code__.co_names
-        if isinstance(known.get(name), compiled)
-    }
-    bound = FunctionType(
-        function.__code__, known | called, function.__name__, function.__defaults__
-    )
-    bound.__module__ = function.__module__
-    bound.__qualname__ = function.__qualname__
-    machine = njit(error_model="numpy")(bound)
-    name = f"{function.__module__}.{function.__qualname__}"
-    # numba creates the attribute at run time.
-    machine._cache = _CodeCache(name, _compute_digest(b"".join(marked.iterate_source())))  # type: ignore[attr-defined]
-    return machine
 
 
 class _CodeCache:
@@ -210,13 +202,12 @@ class _CodeCache:
         # Without a home folder, or permission to read it, there is no cache.
         with suppress(OSError):
             path = self._build_path(types, target.codegen())
-            if path.is_file():
-                content = path.read_bytes()
-                code = content[DIGEST_BYTES:]
-                # Damaged machine code must never run.
-                if content[:DIGEST_BYTES] == _compute_digest(code):
-                    return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
-                _print_once(f"{path} is damaged; the function is compiled again")
+            content = path.read_bytes()
+            code = content[DIGEST_BYTES:]
+            # Damaged machine code must never run.
+            if content[:DIGEST_BYTES] == _compute_digest(code):
+                return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
+            _print_once(f"{path} is damaged; the function is compiled again")
         if on_compile is not None:
             on_compile(self._name)
         return None
@@ -247,7 +238,8 @@ class _CodeCache:
         except OSError as error:
             _print_once(
                 "compiled code cannot be saved, so every launch compiles it again:"
-                f" {error.filename}: {error.strerror}; {CACHE_HINT}"
+                f" {error.filename}: {error.strerror}; set XDG_CACHE_HOME to a folder that can be"
+                " written"
             )
 
     def _build_path(self, types: Any, codegen: Any) -> Path:

@@ -20,7 +20,7 @@ Key = tuple[str, int, int, int]
 Sample = Any
 """A `rack.levels.arm.Sensed`. It is not imported because that would import MuJoCo."""
 
-STUCK_SENSOR_ERROR = np.array([[1e-2], [1e-2]])
+STUCK_SENSOR_ERROR = 1e-2
 """Error above which a stuck sensor must be detected, in rad and rad/s.
 
 While a joint creeps, the error of its stuck sensor grows slowly and need not be detected earlier.
@@ -36,15 +36,11 @@ class Fault(NamedTuple):
     since: int  # tick at which it began
     step: object  # carries out the fault; its class is in `Executor.faults`
 
-    @property
-    def joint(self) -> int:
-        """Index of the joint that the fault affects. -1 for all joints."""
-        return int(self.parameters.get("joint", -1))
-
     def mark_joints(self, count: int) -> NDArray[np.bool_]:
         """Return a mask of the affected joints of a device with `count` joints."""
-        joints = np.arange(count)
-        return np.asarray((joints == self.joint) | (self.joint < 0))
+        # The index of the joint, or -1 for all joints.
+        joint = self.parameters.get("joint", -1)
+        return np.asarray((np.arange(count) == joint) | (joint < 0))
 
 
 @dataclass(frozen=True)

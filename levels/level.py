@@ -279,8 +279,8 @@ class PortOwner:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (WrittenPort,))
+        cls.inputs = collect_ports(cls, "inputs", InputPort)
+        cls.outputs = collect_ports(cls, "outputs", WrittenPort)
 
 
 class LevelSection(PortOwner):
@@ -415,7 +415,7 @@ class Executor(LevelSection, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.finding_kinds = collect_ports(cls, "finding_kinds", (FindingKind,))
+        cls.finding_kinds = collect_ports(cls, "finding_kinds", FindingKind)
         for name, kind in cls.finding_kinds.items():
             if kind.mistake:
                 raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")

@@ -200,7 +200,8 @@ class Orders:
         self._in_force = _CommandAnswer(0, Answer.NONE)
         # State before the newest command, which is restored if that command is refused.
         self._before = self.basis, self.standing, self._in_force
-        self._news: list[_CommandAnswer] = []  # answers that no status has shown
+        # Answers that no status has shown, by the serials of their commands, oldest first.
+        self._news: dict[int, _CommandAnswer] = {}
         self._shown = self._in_force
 
     @property
@@ -245,11 +246,11 @@ class Orders:
         for message in (*operator.earlier, operator.message):
             replaced = self.in_force
             if self._accept_command(message):
-                taken = taken or message.what not in PASSING_OPERATIONS
+                taken |= message.what not in PASSING_OPERATIONS
                 if judge is not None and message.what not in CLOCK_OPERATIONS:
                     judge(message)
             if self.in_force != replaced:
-                self._news = [answer for answer in self._news if answer.serial != replaced]
+                self._news.pop(replaced, None)
         return taken
 
     def _accept_command(self, message: OperatorCommand) -> bool:
@@ -262,7 +263,7 @@ class Orders:
         operation = message.what
         goal = message.goal
         known = {**self._commands, **dict.fromkeys(CLOCK_OPERATIONS, ())}
-        if operation not in known or goal not in (known[Operation(operation)] or (Goal.NONE,)):
+        if operation not in known or goal not in (known[operation] or (Goal.NONE,)):
             self.refuse_newest(
                 f"{describe_command(operation, goal)} is not a command of this level; permitted:"
                 f" {format_commands(self._commands)}"
@@ -328,11 +329,7 @@ class Orders:
 
     def _queue_answer(self, answer: _CommandAnswer) -> None:
         """Queue an answer for the status. It replaces an older answer to the same command."""
-        for at, waiting in enumerate(self._news):
-            if waiting.serial == answer.serial:
-                self._news[at] = answer
-                return
-        self._news.append(answer)
+        self._news[answer.serial] = answer
 
     def find_basis(self, above: int) -> int:
         """Return the serial of the newest operator command on which this cycle is based.
@@ -347,7 +344,7 @@ class Orders:
         For `above` see `find_basis`.
         """
         if self._news:
-            self._shown = self._news.pop(0)
+            self._shown = self._news.pop(next(iter(self._news)))
         status.operator = self.find_basis(above)
         status.order = self._shown.serial
         status.answer = self._shown.answer

@@ -253,7 +253,7 @@ RESERVED_NAMES = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTA
 """Names that no finding may have: alarms, and events of boards and faults."""
 
 
-def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
+def collect_ports(level: type, attribute: str, kind: type) -> dict[str, Any]:
     """Return the ports or findings of a class, keyed by name: inherited ones, then its own.
 
     A class removes an inherited port or finding by setting the attribute to None.
@@ -261,7 +261,7 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
     Args:
         level: The class.
         attribute: Name of the class attribute that lists the ports of each base class.
-        kinds: Classes of the ports to collect.
+        kind: Class of the ports to collect.
 
     Raises:
         LevelError: The class has a port and another attribute of the same name, or lists its ports
@@ -272,13 +272,13 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
             f"class {level.__name__}: '{attribute}' is no longer a dict: each port is an attribute"
             " of the class, as in status = Output(MyStatus)"
         )
-    noun = "finding" if FindingKind in kinds else "port"
+    noun = "finding" if kind is FindingKind else "port"
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
         known |= {port.name: port for port in vars(base).get(attribute, {}).values()}
     ports = dict(known)
     for name, value in vars(level).items():
-        if isinstance(value, kinds):
+        if isinstance(value, kind):
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
                 raise LevelError(
                     f"class {level.__name__}: {noun} '{name}' has the name of another attribute;"

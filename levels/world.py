@@ -68,18 +68,17 @@ class WorldModel(Executor):
             model.revision = tick + 1
         else:
             self._interval = tick - self._seen_tick
-            if self._update_velocity(poses, model.velocity, self._interval * self.context.tick_s):
+            if self._update_velocity(poses, self._interval * self.context.tick_s):
                 model.revision = tick + 1
         model.position = scene.position
         model.quaternion = scene.quaternion
         model.sensed = self._seen_tick = tick
 
-    def _update_velocity(self, poses: Array, velocity: Array, elapsed_s: float) -> bool:
+    def _update_velocity(self, poses: Array, elapsed_s: float) -> bool:
         """Update the velocities from new poses.
 
         Args:
             poses: Poses of the bodies, (bodies, 7).
-            velocity: Receives the estimated velocities, (bodies, 3), m/s.
             elapsed_s: Time since the last scene, s.
 
         Returns:
@@ -99,15 +98,14 @@ class WorldModel(Executor):
         self._rest[rests] = poses[rests]
         self._moving ^= changes
         moved = (poses[:, :3] - self._last[:, :3]) / elapsed_s
-        velocity[:] = np.where(self._moving[:, None], moved, 0.0)
+        self.model.velocity[:] = np.where(self._moving[:, None], moved, 0.0)
         self._last = poses
         return bool(changes.any())
 
 
 def compute_distances(poses: Array, others: Array) -> Array:
     """Return the distance in m between each pair of corresponding poses; both are (bodies, 7)."""
-    x, y, z = (poses - others)[:, :3].T
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
+    return np.asarray(np.linalg.norm((poses - others)[:, :3], axis=1))
 
 
 def compute_angles(poses: Array, others: Array) -> Array:

@@ -12,24 +12,14 @@ instead.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.faulty import FaultyLink
-from rack.levels.arm.guard import GuardedArm, narrow_bounds_by_errors
-from rack.levels.arm.latency_compensation import build_present_link
+from rack.levels.arm.guard import GuardedArm
+from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.arm.link import Link
-from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
-from rack.levels.robot.cell import Cell
 from rack.levels.tables import SensorConfig
-
-
-class ArmLinks(NamedTuple):
-    """Links between the servo level and an arm, without and with injected faults."""
-
-    faultless: Link
-    faulty: FaultyLink
 
 
 class Arm(BrakedArm):
@@ -60,8 +50,8 @@ class Arm(BrakedArm):
         speed_fraction: float,
         acted: dict[int, bool],
         holds: Callable[[], bool],
-    ) -> ArmLinks:
-        """Return the links through which the servo level drives the arm.
+    ) -> FaultyLink:
+        """Return the link through which the servo level drives the arm.
 
         Args:
             tick_s: Duration of a tick, s.
@@ -73,28 +63,17 @@ class Arm(BrakedArm):
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
         """
-        link = build_present_link(self, tick_s)
+        encoders = self.cell.encoders
+        is_present = encoders.offset is None and not encoders.latency_ticks
+        link: Link = self if is_present else PresentLink(self, tick_s)
         if not self.keeps_limits:
             link = self._guard = GuardedArm(self, tick_s, link, speed_fraction)
-        return ArmLinks(link, FaultyLink(self, acted, link, holds))
+        return FaultyLink(self, acted, link, holds)
 
     def permit_speed(self, speed_fraction: float) -> None:
         """Set the fraction of the velocity limits that the link permits."""
         if self._guard is not None:
             self._guard.permit_speed(speed_fraction)
-
-    @classmethod
-    def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
-        """Return the reason why `connect` would fail for a cell, or an empty string.
-
-        Called before the launch.
-        """
-        try:
-            if not cls.keeps_limits:
-                narrow_bounds_by_errors(cell, speed_fraction)
-        except RobotError as error:
-            return str(error)
-        return ""
 
     def look(self, scene: Scene) -> None:
         """Fill a `Scene` with the sensed poses of bodies and tool.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import daqp
 import numpy as np
@@ -57,9 +58,13 @@ class LimitGate:
         range_ends = low + RANGE_MARGIN_RAD, high - RANGE_MARGIN_RAD
         # In the row order of `is_clear`.
         self._limits = np.stack((bounds.torque, fastest, *range_ends, braking, dynamics.dry))
-        self._torque, self._fastest, self._low, self._high, self._braking, _ = self._limits
+        self._torque, self._fastest, self._low, self._high, *_ = self._limits
         self._period_s = period_s
         self._dynamics = dynamics
+        # Highest permitted speed towards an end of the range, (joints,), rad/s.
+        self._limit_speed = partial(
+            compute_stoppable_speed, fastest=fastest, braking=braking, period_s=period_s
+        )
         self._is_clear = is_clear.load_machine_code()
         joints = len(braking)
         self._inertia = np.eye(joints)
@@ -120,12 +125,6 @@ class LimitGate:
             np.clip(
                 (mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque
             )
-        )
-
-    def _limit_speed(self, distance: Array, speed: Array) -> Array:
-        """Return the highest permitted speed towards an end of the range, (joints,), in rad/s."""
-        return compute_stoppable_speed(
-            distance, speed, self._fastest, self._braking, self._period_s
         )
 
 
@@ -244,16 +243,13 @@ class SetPointGate:
     sensed state for velocity set points, and from the last set point for position set points.
     """
 
-    def __init__(
-        self, arm: BrakedArm, bounds: Bounds, tick_s: float, span_s: float, last: Array
-    ) -> None:
+    def __init__(self, arm: BrakedArm, bounds: Bounds, tick_s: float, last: Array) -> None:
         """Prepare a gate.
 
         Args:
             arm: The arm.
             bounds: Limits to keep.
             tick_s: Duration of a tick, s.
-            span_s: Time for which a set point must be safe, because later cycles may be missed, s.
             last: Receives the last set point, (2, joints), rad and rad/s.
         """
         cell = arm.cell
@@ -265,6 +261,8 @@ class SetPointGate:
         narrowed = narrow_bounds(bounds, cell.limits)
         self._fastest = narrowed.velocity
         self._dynamics = Dynamics(cell)
+        # A set point must be safe for this time, because later cycles may be missed.
+        span_s = arm.patience * tick_s
         self._gate = LimitGate(narrowed, self._braking, span_s, self._dynamics)
         self._most_change = MAX_ACCELERATION_FACTOR * self._braking * self._period_s  # rad/s
         # No joint can reach a set point farther than this from its sensed position in a cycle.

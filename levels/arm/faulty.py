@@ -37,21 +37,21 @@ class FaultyLink:
         self,
         arm: BrakedArm,
         acted: dict[int, bool],
-        link: Link | None = None,
-        holds: Callable[[], bool] = bool,
+        link: Link,
+        holds: Callable[[], bool],
     ) -> None:
         """Connect the servo level to an arm.
 
         Args:
             arm: The arm.
             acted: Collects the faults that have an effect, for `Executor.acted`.
-            link: Link to the arm. None if the arm is driven directly.
+            link: Link to the arm, or the arm.
             holds: Returns True if the gripper may hold an object, as far as the level knows.
         """
         cell = arm.cell
         self._arm = arm
         self._holds = holds
-        self._next: Link = link or arm
+        self._next = link
         self._effects = acted
         self._limits = limits = cell.bounds.torque
         # Friction may change from helping to resisting, and so hide twice its value.

@@ -96,8 +96,7 @@ class GuardedArm:
         self._fastest = speed_fraction * cell.bounds.velocity + cell.encoders.velocity_error
         self._gate = LimitGate(bounds, cell.limits.acceleration, self._span_s, self._dynamics)
         if cell.interface != "torque":
-            last = self._last_set_point
-            self._set_points = SetPointGate(self._arm, bounds, self._tick_s, self._span_s, last)
+            self._set_points = SetPointGate(self._arm, bounds, self._tick_s, self._last_set_point)
 
     def sense(self) -> Sensed:
         """Return the newest sample, after checking it against the limits."""
@@ -114,14 +113,12 @@ class GuardedArm:
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Pass on the torque, (joints,), N m, cut to the limits; see `Link.drive`."""
         arm = self._arm
-        if (refused := arm.refused(torque)) is not None:
+        refused = arm.refused(torque) or (arm.exceeded and arm.exceeded.finding)
+        if refused is not None:
             arm.brake()
             return refused
         state = self._state
         assert state is not None, "the arm is sensed before it is driven"
-        if arm.exceeded is not None:
-            arm.brake()
-            return arm.exceeded.finding
         torque, cut = self._gate.limit_torque(torque, state.position, state.velocity)
         arm.clipped += cut
         return arm.drive(torque, grip_force)

@@ -13,7 +13,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, solve
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.link import JointTarget, Link, Sensed, copy_sample
+from rack.levels.arm.link import JointTarget, Sensed, copy_sample
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 
@@ -33,16 +33,6 @@ class PresentState(NamedTuple):
     # Like `state`, but a joint whose sample has not changed keeps its last value, because its
     # sensor may be stuck.
     reported: Sensed
-
-
-def build_present_link(arm: BrakedArm, tick_s: float) -> Link:
-    """Return a link that corrects the latency and the offset of an arm's samples.
-
-    If there is nothing to correct, the link is the arm itself.
-    """
-    encoders = arm.cell.encoders
-    is_present = encoders.offset is None and not encoders.latency_ticks
-    return arm if is_present else PresentLink(arm, tick_s)
 
 
 class PresentLink:

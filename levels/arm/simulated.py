@@ -74,9 +74,7 @@ class SimulatedArm(Simulation, Arm):
         if cell.interface != "torque":
             rows = d.userdata[-SET_POINT_ROWS * joints :].reshape(SET_POINT_ROWS, joints)
             self._drives = CascadedDrives(cell, dynamics, tick_s, every, rows)
-            self._set_points = SetPointGate(
-                self, cell.bounds, tick_s, self.patience * tick_s, rows[:2]
-            )
+            self._set_points = SetPointGate(self, cell.bounds, tick_s, rows[:2])
             self.reports_torque = every == 1
         # Until the first step, the wrist sensor must sense a braked arm, not a falling one.
         if self._wrist is not None:
@@ -120,12 +118,12 @@ class SimulatedArm(Simulation, Arm):
         """
         self._apply_grip_force(grip_force)
         finding = self.refused(torque)
-        if finding is not None:
+        if finding is None:
+            self._command[:] = torque
+            self._release_brakes()
+        else:
             self.brake()
-            return finding
-        self._command[:] = torque
-        self._release_brakes()
-        return None
+        return finding
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow a set point for the coming cycle; see `Link.follow`."""

@@ -123,41 +123,28 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = compute_push_force(pushes, self._now_s)
-        if self.late_s != self._shift_s:
-            self._simulate_shift()
-            return
-        self._make_steps()
-
-    def _simulate_shift(self) -> None:
-        """Simulate a tick that is longer or shorter, because the lateness of the clock changes."""
+        # While the lateness of the clock changes, a tick is longer or shorter.
         option = self._model.opt
         step_s = option.timestep
         option.timestep += (self.late_s - self._shift_s) / len(self._steps.seen)
         self._shift_s = self.late_s
-        self._make_steps()
-        option.timestep = step_s
-
-    def _make_steps(self) -> None:
-        """Make the steps of a tick."""
         steps_made = self._advance(0, self._tick_end_s, *self._steps)
         if steps_made < 0:
-            self._finish_failed_tick(-steps_made)
+            self._finish_failed_tick(steps_made)
         elif self.struck:
             self.struck -= 1
+        option.timestep = step_s
 
     def _finish_failed_tick(self, steps_made: int) -> None:
-        """Complete a tick in which step `steps_made` failed a check.
+        """Complete a tick in which step -`steps_made` failed a check.
 
         The remaining steps are made, and contacts and violated limits are counted and reported. If
         the simulation itself has failed, the state before the tick is restored instead.
         """
         touches = self.touches
-        self._count_contacts()
-        while steps_made < len(self._steps.seen):
-            steps_made = self._advance(steps_made, self._tick_end_s, *self._steps)
-            if steps_made < 0:
-                steps_made = -steps_made
-                self._count_contacts()
+        while steps_made < 0:
+            self._count_contacts()
+            steps_made = self._advance(-steps_made, self._tick_end_s, *self._steps)
         if self.touches > touches and self.contact is not None:
             self.report_finding(Finding(Alarm.COLLISION, *self.contact))
             self.struck = STRUCK_TICKS
@@ -176,8 +163,9 @@ class Simulation(Plant):
         if not len(pairs):
             return
         if not self.first_touch:
-            named = self.describe_contact(pairs[0])
-            self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
+            self.first_touch = (
+                f"unintended contact: {self.describe_contact(pairs[0])} at {self._data.time:.3f} s"
+            )
         self.touches += len(pairs)
         own_pairs = pairs[self._mark_own_geoms()[pairs].any(axis=1)]
         if len(own_pairs):
@@ -222,10 +210,11 @@ class Simulation(Plant):
         value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
             quantity, unit = CHECKED_QUANTITIES[row]
-            where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
             low, high = self._steps.judged[:2, row, joint]
-            permitted = f"{low:g} to {high:g} is permitted"
-            self.first_violation = f"{quantity} {value:.6g} {unit} of {where}; {permitted}"
+            self.first_violation = (
+                f"{quantity} {value:.6g} {unit} of joint '{self.cell.joints[joint]}' at"
+                f" {self._now_s:.4f} s, step {step}; {low:g} to {high:g} is permitted"
+            )
         self.report_finding(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
     def _describe_failure(self) -> str:

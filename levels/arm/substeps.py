@@ -95,9 +95,7 @@ def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -
         state: Receives the state, (state_size,).
     """
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
-    first = len(state) - len(asleep)
-    for tree in range(len(asleep)):
-        state[first + tree] = asleep[tree]
+    state[len(state) - len(asleep) :] = asleep
 
 
 @compiled_for(

@@ -13,6 +13,7 @@ from rack.levels.elemental_move.pipeline import (
 )
 from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output
 from rack.levels.messages import (
+    SEGMENTS,
     Error,
     MoveCommand,
     MovePlan,
@@ -170,26 +171,20 @@ class ElementalMoveExecutor(Executor):
                 Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}"
             )
         elif not self._request:
-            self._open_request(tick)
+            # The number of the cycle serves as the id. It stays unique across restarts.
+            self._request = tick // self.context.every
         elif (plan := self._plans.find_answer(self._request)) is not None:
             if plan.error:
                 self._wait_for_path(plan, tick)
             elif not can_join(plan, status.position):
                 # The arm has moved since the request, so the path starts at the wrong position.
-                self._open_request(tick)
+                self._request = tick // self.context.every
             else:
                 segments.replace_first(plan)
                 self._handed_down = plan.move
                 self._close_request()
                 self.status.replans += 1
                 self._replans_of_move += 1
-
-    def _open_request(self, tick: int) -> None:
-        """Request another path.
-
-        The number of the cycle serves as the id of the request. It stays unique across restarts.
-        """
-        self._request = tick // self.context.every
 
     def _close_request(self) -> None:
         """Cancel the request for another path, if one is open."""
@@ -200,7 +195,7 @@ class ElementalMoveExecutor(Executor):
 
     def _fill_window(self, command: TaskCommand, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next planned moves until the window of segments is full."""
-        while not (self._request or self._error or segments.is_full):
+        while not (self._request or self._error or segments.count >= SEGMENTS):
             move = find_move(command.moves[: command.count], self._handed_down + 1)
             if move is None or not self._hand_down(move, segments, tick):
                 return
@@ -266,8 +261,8 @@ class ElementalMoveExecutor(Executor):
         if not abs(opening_gap) < (self.settings.grasp_gap or gripper.rest_threshold):
             return ""
         # Report a fraction of the travel, because an opening may be a length or an angle.
-        travel_part = opening_gap / (gripper.open - gripper.closed)
-        return f"the gripper has closed to {travel_part:.1%} of its way"
+        travel = gripper.open - gripper.closed
+        return f"the gripper has closed to {opening_gap / travel:.1%} of its way"
 
     def _set_error(self, error: Error, reason: str) -> None:
         """Set the error of the present window of moves, unless it already has one."""

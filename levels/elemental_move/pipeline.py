@@ -11,7 +11,6 @@ from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import copy_message
 from rack.levels.algebra import Array
 from rack.levels.messages import (
-    SEGMENTS,
     WINDOW_MOVES,
     Error,
     MoveCommand,
@@ -133,7 +132,7 @@ def can_join(plan: MovePlan, position: Array) -> bool:
         plan: Plan with a path.
         position: Position of the arm, or end of the preceding path, (joints,), rad.
     """
-    return is_close(np.asarray(plan.waypoints[0]), position)
+    return is_close(plan.waypoints[0], position)
 
 
 def find_end(plan: MovePlan) -> Array:
@@ -166,11 +165,6 @@ class SegmentWindow:
     def count(self) -> int:
         """Number of segments in the window."""
         return self._command.count
-
-    @property
-    def is_full(self) -> bool:
-        """True if there is no room for another segment."""
-        return self.count >= SEGMENTS
 
     @property
     def first(self) -> Any:

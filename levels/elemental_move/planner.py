@@ -124,13 +124,12 @@ class ElementalMovePlanner(Planner):
         world = self.world.message
         held = self.primitive.message.held
         if held < 0:
-            grasps = [
-                (m.object, m.tool)
-                for m in self._window
-                if m.verb is Verb.GRASP and m.id > status.done
-            ]
             self._grip = next(
-                ((row, compute_grip(row, tool, world)) for row, tool in grasps if row is not None),
+                (
+                    (move.object, compute_grip(move.object, move.tool, world))
+                    for move in self._window
+                    if move.verb is Verb.GRASP and move.id > status.done and move.object is not None
+                ),
                 None,
             )
         elif self._grip is None or self._grip[0] != held:

@@ -79,7 +79,12 @@ class BlendedPath:
         points, radii = _merge_coincident(*_check_arrays(waypoints, blend))
         steps = np.diff(points, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
-        _check_overlap(radii, lengths)
+        for k, length in enumerate(lengths):
+            if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
+                raise ValueError(
+                    f"path: blends {radii[k]:.4g} and {radii[k + 1]:.4g} rad of corners {k} and"
+                    f" {k + 1} overlap; the line between them is only {length:.4g} rad long"
+                )
         self.waypoints = points  # (k, joints), rad, without coincident ones
         self.blend = radii  # (k,), rad
         self.joints = points.shape[1]
@@ -245,13 +250,3 @@ def _merge_coincident(points: Array, radii: Array) -> tuple[Array, Array]:
     merged[merged < COINCIDENT_RAD] = 0.0
     merged[distinct[0]] = merged[distinct[-1]] = 0.0
     return points[distinct], merged[distinct]
-
-
-def _check_overlap(radii: Array, lengths: Array) -> None:
-    """Raise `ValueError` if the blends at the two ends of a line overlap."""
-    for k, length in enumerate(lengths):
-        if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
-            raise ValueError(
-                f"path: blends {radii[k]:.4g} and {radii[k + 1]:.4g} rad of corners {k} and {k + 1}"
-                f" overlap; the line between them is only {length:.4g} rad long"
-            )

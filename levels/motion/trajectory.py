@@ -91,24 +91,18 @@ def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> Spe
             smaller fraction leaves more of the limits for acceleration along the path.
     """
     first, second, third = piece
-    velocity = limits.velocity
-    acceleration = limits.acceleration
-    jerk = limits.jerk
-    curved = bool(second.any())
-    speed = compute_least_ratio(velocity, first)
-    if curved:
-        speed = min(
-            speed,
-            share * math.sqrt(compute_least_ratio(acceleration, second)),
-            share * math.cbrt(compute_least_ratio(jerk, third)),
-        )
-    acceleration_left = np.maximum(acceleration - second * speed**2, 0.0)
-    jerk_left = np.maximum(jerk - third * speed**3, 0.0)
-    max_acceleration = compute_least_ratio(acceleration_left, first)
-    if curved:
-        max_acceleration = min(
-            max_acceleration, 0.5 * compute_least_ratio(jerk_left, 3.0 * second * speed)
-        )
+    # On a straight piece, the ratios to `second` and `third` are infinite.
+    speed = min(
+        compute_least_ratio(limits.velocity, first),
+        share * math.sqrt(compute_least_ratio(limits.acceleration, second)),
+        share * math.cbrt(compute_least_ratio(limits.jerk, third)),
+    )
+    acceleration_left = np.maximum(limits.acceleration - second * speed**2, 0.0)
+    jerk_left = np.maximum(limits.jerk - third * speed**3, 0.0)
+    max_acceleration = min(
+        compute_least_ratio(acceleration_left, first),
+        0.5 * compute_least_ratio(jerk_left, 3.0 * second * speed),
+    )
     max_jerk = compute_least_ratio(
         np.maximum(jerk_left - 3.0 * second * speed * max_acceleration, 0.0), first
     )
@@ -150,7 +144,7 @@ def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimi
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
         following = limits[k + 1].speed if k + 1 < len(limits) else 0.0
         speeds.append(min(compute_reachable_speed(speeds[k], length, limit), following))
-    for k in range(len(lengths) - 1, -1, -1):
+    for k in reversed(range(len(lengths))):
         speeds[k] = min(speeds[k], compute_reachable_speed(speeds[k + 1], lengths[k], limits[k]))
     return speeds
 
@@ -191,10 +185,10 @@ class Trajectory:
         start, *state = self.sections[max(k, 0)].tolist()
         return PathState(*_integrate_jerk(time_s - start, *state))
 
-    def evaluate_states(self, times_s: Array) -> tuple[Array, Array, Array]:
-        """Return s, ds and dds, (n,) each, at `times_s`, (n,). All must be within the duration."""
+    def evaluate_states(self, times_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Return s, ds, dds and jerk, (n,) each, at `times_s`, (n,), all within the duration."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
-        return _integrate_jerk(times_s - row[:, 0], *row[:, 1:].T)
+        return *_integrate_jerk(times_s - row[:, 0], *row[:, 1:].T), row[:, 4]
 
     def stretch_by(self, factor: float) -> Trajectory:
         """Return the same motion slowed down by `factor`, which must be at least 1.
@@ -369,9 +363,8 @@ def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bo
     The check uses bounds of motion and path over each interval of time.
     """
     times = _find_check_times(stop)
-    s, ds, dds = stop.evaluate_states(times)
-    section = np.searchsorted(stop.sections[:, 0], times[:-1], side="right") - 1
-    jerk = np.abs(stop.sections[section, 4])[:, None]
+    s, ds, dds, jerk = stop.evaluate_states(times)
+    jerk = np.abs(jerk[:-1])[:, None]
     # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
     acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))[:, None]
     speed = np.maximum(ds[:-1], ds[1:])[:, None]
@@ -407,7 +400,7 @@ def _find_check_times(stop: Trajectory) -> Array:
     )
 
 
-def _find_bounds_between(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
+def _find_bounds_between(path: BlendedPath, s: Array) -> PathBounds:
     """Return bounds of the path's first three derivatives between consecutive values of `s`.
 
     Each bound is (n - 1, joints).
@@ -419,4 +412,4 @@ def _find_bounds_between(path: BlendedPath, s: Array) -> tuple[Array, Array, Arr
     for k in range(1, int((high - low).max()) + 1):
         for total, bound in zip(bounds, path.bounds, strict=True):
             np.maximum(total, bound[np.minimum(low + k, high)], out=total)
-    return bounds[0], bounds[1], bounds[2]
+    return PathBounds(*bounds)

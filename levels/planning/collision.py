@@ -18,6 +18,7 @@ from rack.levels.compiled import compiled, compiled_for
 from rack.levels.planning.pose import Pose, read_site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
+    add_offset,
     build_contact_views,
     mj_collision,
     mj_kinematics,
@@ -158,19 +159,18 @@ class CollisionChecker:
             m.geom_conaffinity[self._row_geoms[row]] &= LINK
         self._update_required()
 
-    def permit_contact(self, row: int | None, touch: bool = True) -> None:
+    def permit_contact(self, row: int | None) -> None:
         """Permit contact of one object with supports and gripper, and of no other object.
 
         While contact is permitted, the gripper only has to keep `margin` from supports.
 
         Args:
             row: Row of the object, or None for no object.
-            touch: False permits contact of no object.
         """
-        self._touched = row if touch else None
+        self._touched = row
         self._update_required()
 
-    def is_free(self, q: Array, clearance: float | None = None) -> bool:
+    def is_free(self, q: Array, clearance: float = np.inf) -> bool:
         """Return True if the arm keeps its required distances at a configuration.
 
         Args:
@@ -180,7 +180,7 @@ class CollisionChecker:
         self._one[0] = q
         return self.find_first_blocked(self._one, clearance) == 1
 
-    def find_first_blocked(self, path: Array, clearance: float | None = None) -> int:
+    def find_first_blocked(self, path: Array, clearance: float = np.inf) -> int:
         """Find the first configuration of a path that is not free. Later ones are not checked.
 
         Args:
@@ -190,7 +190,7 @@ class CollisionChecker:
         Returns:
             Index of that configuration, or n if all are free.
         """
-        self._least = np.inf if clearance is None else float(clearance)
+        self._least = clearance
         held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
         return self._first_blocked(held_qpos, self._least, path)
 
@@ -212,9 +212,9 @@ class CollisionChecker:
             return -1.0
         # The distance of a close pair limits the clearance, even if less is required of the pair.
         lacking = short[close] + (self.clearance - required[close])
-        return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
+        return self.clearance - float(np.max(lacking, initial=0.0))
 
-    def describe_collision(self, q: Array, clearance: float | None = None) -> str:
+    def describe_collision(self, q: Array, clearance: float = np.inf) -> str:
         """Describe the worst violation at a configuration.
 
         Args:
@@ -235,9 +235,10 @@ class CollisionChecker:
         worst = int(np.argmax(short))
         first, second = self._data.contact.geom[worst]
         distance = self._data.contact.dist[worst]
-        pair = f"'{find_geom_name(self._model, first)}' and '{find_geom_name(self._model, second)}'"
-        required = distance + short[worst]
-        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
+        return (
+            f"'{find_geom_name(self._model, first)}' and '{find_geom_name(self._model, second)}'"
+            f" are {distance * 1e3:.1f} mm apart; valid: {(distance + short[worst]) * 1e3:.1f} mm"
+        )
 
     def _compute_shortfalls(self) -> Array:
         """Return the required minus the actual distance of each close pair of geoms, in m.
@@ -461,13 +462,7 @@ def carry_object(pose: Array, tool: Array, turned: Array, offset: Array) -> None
         turned: Rotation matrix of the tool, (9,).
         offset: Pose of the object in the frame of the tool, (7,).
     """
-    for i in range(3):
-        along = (
-            turned[3 * i] * offset[0]
-            + turned[3 * i + 1] * offset[1]
-            + turned[3 * i + 2] * offset[2]
-        )
-        pose[i] = tool[i] + along
+    add_offset(tool, turned, offset, pose)
     quaternion = np.empty(4)
     mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
     mju_mul_quat(pose[3:].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)

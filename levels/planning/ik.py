@@ -7,8 +7,6 @@ but the last bits of its matrix products depend on the processor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 
@@ -57,7 +55,6 @@ class InverseKinematics:
         joints = len(cell.qpos)
         self._jacobian = np.zeros((6, cell.model.nv))
         self._factor = np.zeros((joints, joints + 7))  # work space of the solver
-        self._low, self._high = find_sampling_range(cell)
 
     def compute_tool_pose(self, q: Array) -> Pose:
         """Return the pose of the tool at a configuration.
@@ -109,27 +106,6 @@ class InverseKinematics:
             return None
         return solution
 
-    def find_free_solutions(
-        self,
-        target: Pose,
-        reference: Array,
-        free: Callable[[Array], bool],
-        restarts: int = MAX_RESTARTS,
-    ) -> list[Array]:
-        """Find distinct collision-free configurations, the quickest to reach first.
-
-        Args:
-            target: Pose for the tool.
-            reference: Configuration from which the arm moves to them, (joints,), rad.
-            free: Returns True if a configuration is free.
-            restarts: Maximum number of random starts.
-
-        Returns:
-            Configurations, (joints,), rad. Empty if the target is out of reach or everything
-            collides.
-        """
-        return [q for q in self.find_solutions(target, reference, restarts=restarts) if free(q)]
-
     def find_solutions(
         self,
         target: Pose,
@@ -160,7 +136,7 @@ class InverseKinematics:
                 solutions.append(q)
             if len(solutions) == MAX_SOLUTIONS or (solutions and idle >= MAX_IDLE_STARTS):
                 break
-            start = rng.uniform(self._low, self._high)
+            start = rng.uniform(*find_sampling_range(self._cell))
         return sorted(solutions, key=lambda q: self.compute_travel_time(reference, q))
 
     def compute_travel_time(self, start: Array, end: Array) -> float:

@@ -120,9 +120,11 @@ class MotionPlanner:
             beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
             if beyond.size:
                 j = int(beyond[0])
-                where = f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad"
-                valid = f"valid: {low[j]:.4g} to {high[j]:.4g}"
-                raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
+                raise Refused(
+                    Error.UNREACHABLE,
+                    f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad; valid:"
+                    f" {low[j]:.4g} to {high[j]:.4g}",
+                )
             return move.joints
         if move.posture:
             nearest = self.ik.find_nearby(move.tool, move.joints)
@@ -156,17 +158,14 @@ class MotionPlanner:
 
         The reason is a blocked start or goal, or the obstacle on the straight line between them.
         """
-        collision_text = self.checker.describe_collision(
-            start, clearance
-        ) or self.checker.describe_collision(goal, clearance)
-        if collision_text:
-            return collision_text
+        for q in (start, goal):
+            if text := self.checker.describe_collision(q, clearance):
+                return text
         straight = Path(np.array([start, goal]), np.zeros(2))
         blocked = self.paths.find_blocked_configuration(straight, self._bind_clearance(clearance))
-        obstacle = (
-            self.checker.describe_collision(blocked, clearance) if blocked is not None else ""
-        )
-        return f"no path found around {obstacle}" if obstacle else "no path found"
+        if blocked is None:
+            return "no path found"
+        return f"no path found around {self.checker.describe_collision(blocked, clearance)}"
 
     def _plan_line(self, move: Move, start: Array, goal: Array | None) -> Path:
         """Plan a straight line of the tool. See `plan` for the arguments.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array
-from rack.levels.messages import TaskCommand, TaskPlan, Verb
+from rack.levels.messages import TaskCommand, Verb
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose, make_pose
 
@@ -50,8 +50,8 @@ class Move(NamedTuple):
         record["by"] = self.by_s
 
 
-def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
-    """Return copies of the moves of a `TaskCommand` or a `TaskPlan`, oldest first."""
+def read_window(command: TaskCommand) -> list[Move]:
+    """Return copies of the moves of a `TaskCommand`, oldest first."""
     return [
         Move(
             id=int(record["id"]),

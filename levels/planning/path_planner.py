@@ -305,8 +305,7 @@ def list_bisection_points(ends: Array, count: int) -> Array:
     for k in range(1, count):
         first, last = stretches[k]
         middle = (first + last) // 2
-        for j in range(ends.shape[1]):
-            places[k, j] = ends[0, j] + (ends[1, j] - ends[0, j]) * (middle / count)
+        places[k] = ends[0] + (ends[1] - ends[0]) * (middle / count)
         for half in ((first, middle - 1), (middle + 1, last)):
             if half[0] <= half[1]:
                 stretches[stretch_count] = half

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from rack.levels.algebra import Array, Ints
+from rack.levels.algebra import Array, Ints, norm
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose, make_pose, read_site_pose
@@ -58,7 +58,6 @@ class Payloads:
         self._names = names
         self._dynamics = Dynamics(cell)
         self._data = cell.build_start_data()
-        self._rest = np.zeros(len(cell.home))
         self.jaws = self._find_jaws()
 
     def check_grip(self, row: int, grip: Pose) -> None:
@@ -67,12 +66,14 @@ class Payloads:
         Raises:
             Refused: The grip is too weak. The text contains the needed and the available force.
         """
-        gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
-        needed = MIN_GRIP_FACTOR * self._find_mass(row) * gravity
+        needed = MIN_GRIP_FACTOR * self._find_mass(row) * norm(self._cell.model.opt.gravity)
         holds = self._compute_holding_force(row, grip)
         if holds is not None and holds < needed:
-            shortage = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
-            raise Refused(Error.OVERLOAD, f"payload {self._format_object(row)} needs {shortage}")
+            raise Refused(
+                Error.OVERLOAD,
+                f"payload {self._format_object(row)} needs {needed:.1f} N of grip; the gripper"
+                f" holds {holds:.1f} N",
+            )
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
         """Check that the motors can carry an object.
@@ -90,15 +91,13 @@ class Payloads:
         payload = Payload(self._find_mass(row), centre.position)
         limit = MAX_MOTOR_PART * self._cell.bounds.torque
         for q in configurations:
-            load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
+            load = np.abs(self._dynamics.terms(q, np.zeros_like(q), payload).bias)
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
-                joint = self._cell.joints[worst]
-                shortage = (
-                    f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
-                )
                 raise Refused(
-                    Error.OVERLOAD, f"payload {self._format_object(row)} needs {shortage}"
+                    Error.OVERLOAD,
+                    f"payload {self._format_object(row)} needs {load[worst]:.1f} N m of"
+                    f" '{self._cell.joints[worst]}'; its motor carries {limit[worst]:.1f} N m",
                 )
 
     def _find_mass(self, row: int) -> float:
@@ -116,9 +115,10 @@ class Payloads:
         """
         width = self._measure_width(row, grip)
         # Find the last sample whose gap is wider than the object, and the first whose gap is not.
-        pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
-        wide, narrow = next(pairs, (None, None))
-        if wide is None or narrow is None:
+        for wide, narrow in pairwise(self.jaws):
+            if wide.gap > width >= narrow.gap:
+                break
+        else:
             return None
         model = self._cell.model
         gripper = self._cell.gripper
@@ -234,12 +234,9 @@ def _compute_friction(model: mujoco.MjModel, one: int, other: int) -> float:
 
     It is 0 if their contact is frictionless.
     """
-    if model.geom_priority[one] == model.geom_priority[other]:
-        mixed = [one, other]
-    elif model.geom_priority[one] > model.geom_priority[other]:
-        mixed = [one]
-    else:
-        mixed = [other]
+    priority = model.geom_priority
+    highest = max(priority[one], priority[other])
+    mixed = [k for k in (one, other) if priority[k] == highest]
     if max(model.geom_condim[k] for k in mixed) == 1:
         return 0.0
     return float(max(model.geom_friction[k, 0] for k in mixed))

@@ -25,17 +25,15 @@ class Pose(NamedTuple):
 
     def __matmul__(self, inner: Pose) -> Pose:
         """Return the composition: `inner`, which is relative to this pose, in the outer frame."""
-        position = np.zeros(3)
-        quaternion = np.zeros(4)
-        mujoco.mju_mulPose(position, quaternion, *self, *inner)
-        return Pose(position, quaternion)
+        outer = Pose(np.zeros(3), np.zeros(4))
+        mujoco.mju_mulPose(*outer, *self, *inner)
+        return outer
 
     def inverse(self) -> Pose:
         """Return the inverse: the pose of the reference frame relative to this pose."""
-        position = np.zeros(3)
-        quaternion = np.zeros(4)
-        mujoco.mju_negPose(position, quaternion, *self)
-        return Pose(position, quaternion)
+        inverse = Pose(np.zeros(3), np.zeros(4))
+        mujoco.mju_negPose(*inverse, *self)
+        return inverse
 
     def raise_by(self, height: float) -> Pose:
         """Return the pose moved by `height`, in m, along the world's z axis."""

@@ -89,12 +89,10 @@ class PrimitiveExecutor(Executor):
             round(params.blind / context.tick_s),
         )
         self._gripper = context.robot.gripper
-        self._bring_up = context.robot.bring_up or 1.0
         self._tracking = Tracking()
         self._straying = DeviationMonitor(
             context.robot.joints, params.following, self._rules.count_cycles(params.straying)
         )
-        self._silent_cycles = self._rules.count_cycles(params.silent)
         self._plans = Plans()
         # The state with which the executor continues after a restart is in its last messages.
         self._is_known = False  # the level was in step with the servo, perhaps before a restart
@@ -130,9 +128,10 @@ class PrimitiveExecutor(Executor):
         self._guard.update_scene(self.world, servo.position, tick)
         if self._tracking.in_step:
             self._run_segment(serials, tick, passed_s)
-        elif self._tracking.silent_cycles > self._silent_cycles:
-            reason = f"no status from below for {self._tracking.silent_cycles} cycles"
-            self._fault = SegmentFault(Error.BELOW, reason)
+        elif self._tracking.silent_cycles > self._rules.count_cycles(self.settings.silent):
+            self._fault = SegmentFault(
+                Error.BELOW, f"no status from below for {self._tracking.silent_cycles} cycles"
+            )
         if servo.state == State.ERROR:
             self._fault = SegmentFault(Error(servo.error), servo.reason)
         self._write_set_point(self.command, tick)
@@ -156,28 +155,18 @@ class PrimitiveExecutor(Executor):
         work = self._work
         self._displaced |= self._is_known
         if not self._is_known:
-            force = self._gripper.force if self._gripper is not None else 0.0
             self._is_known = True
             self.command.opening = servo.opening
-            self.command.force = force
+            self.command.force = self._gripper.force if self._gripper is not None else 0.0
         self._fault = None
         self._straying.reset_count()
         self._position[:] = servo.target
-        self._carry_object(self.status.held, tick)
+        self._guard.carry_object(self.status.held, tick - SEEN_CYCLES * self.context.every)
         if isinstance(work, PathWork):
             work.begin_near(self._position, work.progress)
             self._displaced = False
         elif work is not None:
             work.restart_wait()
-
-    def _carry_object(self, row: int, tick: int) -> None:
-        """Attach an object to the tool in the guard's model, as soon as a new scene shows it there.
-
-        Args:
-            row: Row of the object, or -1 for none.
-            tick: Tick of the cycle.
-        """
-        self._guard.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
     def _run_segment(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Run one cycle of the current segment: finish, withdraw, begin or advance it.
@@ -206,13 +195,12 @@ class PrimitiveExecutor(Executor):
                 hold
                 or withdrawn
                 or self._fault is not None
-                or self._straying.is_straying
-                or bool(self._guard.wait_reason)
+                or bool(self._straying.description or self._guard.wait_reason)
             )
             plan = self._plans.find_trajectory(work.segment.id, work.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
-            speed_scale = self._bring_up if self.below.message.slowed else 1.0
-            work.step(hold, plan, self.world.message, due_s, passed_s, speed_scale)
+            speed_scale = self.context.robot.bring_up if self.below.message.slowed else None
+            work.step(hold, plan, self.world.message, due_s, passed_s, speed_scale or 1.0)
             self._position[:] = work.set_point.position
 
     def _finish_segment(self, servo: ServoStatus, tick: int) -> None:
@@ -222,7 +210,7 @@ class PrimitiveExecutor(Executor):
             return
         if isinstance(work, GripperWork):
             self.status.held = work.held_after
-            self._carry_object(work.held_after, tick)
+            self._guard.carry_object(work.held_after, tick - SEEN_CYCLES * self.context.every)
         self.status.done = work.segment.id
         self._work = None
 
@@ -308,17 +296,13 @@ class PrimitiveExecutor(Executor):
                 return serial, begin
         return 0, 0.0
 
-    def _compute_due_tick(self, tick: int) -> int:
-        """Return the tick at which the set point of the cycle released at `tick` is due."""
-        return tick + LEAD_CYCLES * self.context.every
-
     def _write_set_point(self, command: JointCommand, tick: int) -> None:
         """Write the set point. `due` is 0 while the servo is out of step and must not follow it."""
         work = self._work
         in_step = self._tracking.in_step
         command.id = tick // self.context.every + 1 if self._is_known else 0
         # While out of step, the position of the arm is uncertain, and a set point could be wrong.
-        command.due = self._compute_due_tick(tick) if in_step else 0
+        command.due = tick + LEAD_CYCLES * self.context.every if in_step else 0
         set_point = work.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
         command.velocity[:] = set_point.velocity
@@ -337,11 +321,11 @@ class PrimitiveExecutor(Executor):
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
         interrupted = self._interrupted if self._interrupted in serials else 0
         status.current = work.segment.id if work is not None else interrupted
+        servo = self.below.message
         if self.below.has_message:
-            status.opening = self.below.message.opening
+            status.opening = servo.opening
         status.position[:] = self._position
         status.progress = self._progress * bool(interrupted)
-        servo = self.below.message
         status.operated = (
             self._orders.is_in_force or servo.standing > 0 or servo.error == Error.DISABLED
         )
@@ -353,7 +337,8 @@ class PrimitiveExecutor(Executor):
             # If the servo is out of step, that is the reason for the hold, not an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
             status.resting = work.is_resting
-            status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
+            due_tick = tick + LEAD_CYCLES * self.context.every
+            status.ends = work.compute_end_s(due_tick * self.context.tick_s)
         status.wants, status.begin = self._find_wanted_trajectory(serials)
 
     def _find_wait_reason(self) -> str:

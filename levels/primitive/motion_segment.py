@@ -39,16 +39,16 @@ class MotionSegment(MoveSegment):
         """Return the fault to report if the segment cannot be finished before `earliest_s`."""
         # Round up, so that the reported time can be met.
         earliest_s = ceil(earliest_s * 1e3) / 1e3
-        reason = (
-            f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
+        return SegmentFault(
+            Error.TOO_LATE,
+            f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s",
+            earliest_s,
         )
-        return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
 
 def list_serials(command: MoveCommand) -> list[int]:
     """Return the serials of the segments in a `MoveCommand`, oldest first."""
-    serials: list[int] = command.segments["id"][: command.count].tolist()
-    return serials
+    return list(command.segments["id"][: command.count].tolist())
 
 
 def read_segment(command: MoveCommand, serial: int) -> MotionSegment:

@@ -70,7 +70,6 @@ class PathGuard:
         self._cursor = 0.0
         self._obstructed: float | None = None
         self._least = self._clearance
-        self._extrapolated = np.zeros((self._rows, 3))
         self._blind_ticks = blind_ticks
         self._blind = self._rows > 0
         self._waiting: tuple[int, int] | None = (
@@ -101,8 +100,8 @@ class PathGuard:
             world: Newest world model.
         """
         self._checker.open_gripper(opening)
-        row = segment.object if segment.object >= 0 else None
-        self._checker.permit_contact(row, segment.touch)
+        row = segment.object if segment.touch and segment.object >= 0 else None
+        self._checker.permit_contact(row)
         self._checker.place_bodies(world.position, world.quaternion)
         # Motion may start close to an obstacle, but must not get much closer.
         start_clearance = self._checker.find_clearance(path.evaluate(0.0).q)
@@ -150,10 +149,8 @@ class PathGuard:
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
             if moving is not None:
-                np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._extrapolated)
-                self._extrapolated *= moving.velocity[: self._rows]
-                self._extrapolated += moving.position[: self._rows]
-                self._checker.place_bodies(self._extrapolated, moving.quaternion)
+                travel = self._by_themselves * (ahead_s + self._delay_s) * moving.velocity
+                self._checker.place_bodies(moving.position + travel, moving.quaternion)
             if not self._is_free(path, trajectory.evaluate_at(time_s + ahead_s).s):
                 return False
             if time_s + ahead_s > trajectory.duration:
@@ -201,7 +198,7 @@ class PathGuard:
             tick: Tick of the cycle.
         """
         model = world.message
-        is_seen = world.has_message and model.revision > 0
+        is_seen = model.revision > 0
         is_late = not is_seen or tick - model.sensed > self._blind_ticks
         self._blind = self._rows > 0 and is_late
         if self._waiting is not None and is_seen and model.sensed >= self._waiting[1]:

@@ -65,11 +65,6 @@ class PathMotion:
             self.is_resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
         )
 
-    @property
-    def remaining_s(self) -> float:
-        """Time until the present trajectory ends, in s. 0 without a trajectory."""
-        return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
-
     def reset_to(self, s: float, position: Array) -> float:
         """Reset the motion to rest at path parameter `s`, with the set point at the arm.
 

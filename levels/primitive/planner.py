@@ -35,7 +35,6 @@ class PrimitivePlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         limits = build_level_cell(context).limits
-        self._positions = limits.position
         self._rules = WorkRules(context.robot.joints, limits, self.settings, context.period_s)
         self._last_plan = (0, 0.0)
         self._answered_at = 0
@@ -62,7 +61,6 @@ class PrimitivePlanner(Planner):
         plan.segment = serial
         plan.begin = begin
         plan.duration = 0.0
-        plan.earliest = 0.0
         plan.count = 0
         fault: SegmentFault | None = None
         try:
@@ -87,15 +85,14 @@ class PrimitivePlanner(Planner):
             ValueError: The path is invalid or leaves the range of a joint.
         """
         path = segment.build_path()
-        low, high = self._positions.T
+        low, high = self._rules.limits.position.T
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
         if len(outside):
             k, j = outside[0]
-            place = (
+            raise ValueError(
                 f"waypoint {k}, joint '{self.context.robot.joints[j]}' at"
-                f" {path.waypoints[k, j]:.4f} rad"
+                f" {path.waypoints[k, j]:.4f} rad; valid: {low[j]:.4f} to {high[j]:.4f}"
             )
-            raise ValueError(f"{place}; valid: {low[j]:.4f} to {high[j]:.4f}")
         return path
 
 

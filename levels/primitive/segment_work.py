@@ -155,8 +155,11 @@ class PathWork(PathMotion):
         permitted = self._rules.params.astray
         distance = self.reset_to(0.0, position)
         if distance > permitted:
-            begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
-            self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
+            self.fault = SegmentFault(
+                Error.LIMIT,
+                f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests;"
+                f" valid: at most {permitted} rad",
+            )
 
     def begin_near(self, position: Array, progress: float) -> None:
         """Prepare to continue from the point of the path that is nearest to the arm.
@@ -218,13 +221,11 @@ class PathWork(PathMotion):
         settled = self._quiet.count_cycle(bool((distances < self._rules.params.settled).all()))
         if self._quiet.is_overdue and not settled:
             joint = int(distances.argmax())
-            permitted = self._rules.params.settled
-            name = self._rules.joints[joint]
-            reason = (
-                f"joint '{name}' rests {distances[joint]:.4f} rad from its goal; valid: at most"
-                f" {permitted} rad"
+            self.fault = SegmentFault(
+                Error.FOLLOWING,
+                f"joint '{self._rules.joints[joint]}' rests {distances[joint]:.4f} rad from its"
+                f" goal; valid: at most {self._rules.params.settled} rad",
             )
-            self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled
 
     @property
@@ -246,7 +247,8 @@ class PathWork(PathMotion):
         """
         if self.stopping or (self.is_resting and not self.is_finished):
             return 0.0
-        return due_s + self.remaining_s + self._rules.latency_s
+        remaining_s = 0.0 if self.trajectory is None else self.trajectory.duration - self.time_s
+        return due_s + remaining_s + self._rules.latency_s
 
     def _start(self, plan: Trajectory, hold: bool, world: WorldState, due_s: float) -> None:
         """Start the trajectory, unless motion must hold or the path has not been clear long enough.
@@ -302,7 +304,9 @@ class GripperWork:
     def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
         self.segment = segment
         self._gripper = gripper
-        self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
+        closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
+        # Row of the object in the gripper after the segment, or -1 for none.
+        self.held_after = segment.object if closes else -1
         self.fault: SegmentFault | None = None  # why the segment cannot be done
         self._rules = rules
         self.restart_wait()
@@ -314,14 +318,6 @@ class GripperWork:
         """
         self._cycles = 0
         self._quiet = SettlingCounter(self._rules)
-
-    @property
-    def held_after(self) -> int:
-        """Row of the object in the gripper after the segment, or -1 for none.
-
-        It is the object of the segment if the gripper ends nearer to closed than to open.
-        """
-        return self.segment.object if self._closes else -1
 
     def check_done(self, status: DrivenArm) -> bool:
         """Return True if the gripper is at rest.
@@ -336,9 +332,9 @@ class GripperWork:
         permitted = self._rules.params.settled_opening or self._gripper.rest_threshold
         settled = self._quiet.count_cycle(speed < permitted)
         if self._quiet.is_overdue and not settled:
-            reason = (
+            self.fault = SegmentFault(
+                Error.FOLLOWING,
                 f"gripper still moves {speed / self._gripper.travel:.1%} of its way in a second; it"
-                f" must come below {permitted / self._gripper.travel:.1%}"
+                f" must come below {permitted / self._gripper.travel:.1%}",
             )
-            self.fault = SegmentFault(Error.FOLLOWING, reason)
         return settled

@@ -111,11 +111,6 @@ class DeviationMonitor:
         self.description = ""
         self.fault: SegmentFault | None = None
 
-    @property
-    def is_straying(self) -> bool:
-        """True while a joint is too far from its set point."""
-        return self._cycles > 0
-
     def reset_count(self) -> None:
         """Reset the count, and clear `description` and `fault`."""
         self._cycles = 0

@@ -225,7 +225,10 @@ def assemble_cell(
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.mark_descendants(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
-    tool = lookup.find_tool_site(model, robot.tool_name, moved if hand is None else None)
+    name = robot.tool_name
+    tool = lookup.find_element(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
+    if hand is None and not moved[model.site_bodyid[tool]]:
+        raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
     gripper, linked = find_gripper(model, robot, moved, joints)
     if hand is not None:
         # The palm is a part of the hand, although no joint of the hand moves it.

@@ -19,6 +19,7 @@ from rack.levels.algebra import Array, apply_elementwise
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
+    add_offset,
     build_common_view,
     mj_com_pos,
     mj_flex,
@@ -225,9 +226,7 @@ def add_payload(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substep
     bias = evaluation[BIAS_ROW]
     inertia = evaluation[INERTIA_ROW:]
     centre = np.empty(3)
-    for axis in range(3):
-        of = turned[3 * axis : 3 * axis + 3]
-        centre[axis] = tool[axis] + (of[0] * offset[0] + of[1] * offset[1] + of[2] * offset[2])
+    add_offset(tool, turned, offset, centre)
     mj_jac(model, data, jacobians[0].ctypes.data, 0, centre.ctypes.data, hand)
     mj_jac_dot(model, data, jacobians[1].ctypes.data, 0, centre.ctypes.data, hand)
     count = len(dof)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import c_function
+from rack.levels.compiled import c_function, compiled
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -148,3 +148,18 @@ def _build_view(
     """Return an array of type `kind` that views the memory at `address`."""
     memory = (ctypes.c_char * (shape[0] * strides[0])).from_address(address)
     return np.ndarray(shape, kind, memoryview(memory), 0, strides)
+
+
+@compiled
+def add_offset(tool: Array, turned: Array, offset: Array, place: Array) -> None:
+    """Add an offset in the frame of the tool to the position of the tool.
+
+    Args:
+        tool: Position of the tool, (3,), m.
+        turned: Rotation matrix of the tool, (9,).
+        offset: Offset in the frame of the tool, (3,) or more, m.
+        place: Receives the position in its first three elements, m.
+    """
+    for i in range(3):
+        of = turned[3 * i : 3 * i + 3]
+        place[i] = tool[i] + (of[0] * offset[0] + of[1] * offset[1] + of[2] * offset[2])

@@ -132,7 +132,15 @@ class _Solver:
         carried = hand[model.jnt_bodyid]
         # The body that carries the linkage may be moved by a joint of the arm itself.
         carried[arm] = carried[joint] = False
-        check_commanded(model, config, carried)
+        for k in range(model.nu):
+            name = model.actuator(k).name
+            driven = int(model.actuator_trnid[k, 0])
+            is_drive = mujoco.mjtTrn(int(model.actuator_trntype[k])) in JOINT_DRIVES
+            if is_drive and carried[driven] and name != config.actuator:
+                raise RobotError(
+                    f"robot.gripper: joint '{model.joint(driven).name}' has an actuator, '{name}',"
+                    " that nothing commands; name the joint in [[robot.gripper.follow]]"
+                )
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
         self._follow = follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
         self._loose = np.ones(len(follow), dtype=bool)
@@ -279,30 +287,6 @@ class _Solver:
         """Return the Jacobian of all constraints at the present pose, (rows, nv)."""
         mujoco.mj_fwdPosition(self._model, self._data)
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
-
-
-def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Check that only the gripper's actuator drives joints of the gripper.
-
-    No level would command any other actuator.
-
-    Args:
-        model: The compiled model.
-        config: The `[robot.gripper]` table.
-        carried: Mask of the gripper's joints that follow the driven joint, (njnt,).
-
-    Raises:
-        RobotError: A joint has an actuator other than the gripper's actuator.
-    """
-    for k in range(model.nu):
-        name = model.actuator(k).name
-        joint = int(model.actuator_trnid[k, 0])
-        drive = mujoco.mjtTrn(int(model.actuator_trntype[k])) in JOINT_DRIVES
-        if drive and carried[joint] and name != config.actuator:
-            raise RobotError(
-                f"robot.gripper: joint '{model.joint(joint).name}' has an actuator, '{name}', that"
-                " nothing commands; name the joint in [[robot.gripper.follow]]"
-            )
 
 
 def describe_equality(model: mujoco.MjModel, equality: int) -> str:

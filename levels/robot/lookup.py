@@ -99,23 +99,6 @@ def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
                 yield str(error)
 
 
-def find_tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
-    """Return the id of the tool's site.
-
-    Args:
-        model: The compiled model.
-        name: Name of the site.
-        moved: Bodies on which the site may be, (nbody,). None if it may be on any body.
-
-    Raises:
-        RobotError: The site is missing or on another body.
-    """
-    tool = find_element(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
-    if moved is not None and not moved[model.site_bodyid[tool]]:
-        raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
-    return tool
-
-
 def find_free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the ids of the free joints of objects, given the ids of their bodies.
 
@@ -140,9 +123,9 @@ def find_mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """
     for body in bodies:
         if model.body_mocapid[body] < 0:
-            name = model.body(body).name
             raise RobotError(
-                f"scene.obstacles: body '{name}' is not a mocap body; add mocap='true' to it"
+                f"scene.obstacles: body '{model.body(body).name}' is not a mocap body; add"
+                " mocap='true' to it"
             )
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 

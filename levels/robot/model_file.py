@@ -119,8 +119,10 @@ class ModelReader:
         self._bytes += len(text)
         self._files[f"{len(self._files)}.xml"] = (path, root)
         if len(self._files) > MAX_FILES:
-            why = f"more than {MAX_FILES} files are included; does one include itself?"
-            raise RobotError(f"model '{path}': {why}")
+            raise RobotError(
+                f"model '{path}': more than {MAX_FILES} files are included; does one include"
+                " itself?"
+            )
         for element in root.iter():
             if element.tag not in ("include", "model"):
                 self._folders |= {value for key, value in element.items() if key.endswith("dir")}
@@ -166,8 +168,10 @@ class ModelReader:
             copies *= math.prod(max(1.0, n) for n in parse_numbers(element.get("count", "")))
         self._parts += copies * (tag in PART_TAGS)
         if self._parts > MAX_PARTS:
-            why = f"more than {MAX_PARTS} bodies, joints, geoms and sites, with all replicas"
-            raise RobotError(f"model '{file}': {why}")
+            raise RobotError(
+                f"model '{file}': more than {MAX_PARTS} bodies, joints, geoms and sites, with all"
+                " replicas"
+            )
         if depth > MAX_DEPTH:
             raise RobotError(f"model '{file}': more than {MAX_DEPTH} elements within each other")
         for child in element:
@@ -188,12 +192,12 @@ class ModelReader:
                 for place in places
                 for file_name in (asset.as_posix(), asset.name)
             ]
-            if find_file(files) is None:
+            existing = [file for file in files if find_file([file])]
+            if not existing:
                 looked = ", ".join(map(str, places))
                 raise RobotError(f"model '{model}': no file '{name}'; looked for in {looked}")
-            for file in files:
-                if find_file([file]):
-                    check_asset(file, model)
+            for file in existing:
+                check_asset(file, model)
 
 
 def parse_xml(text: bytes) -> ElementTree.Element:

@@ -55,9 +55,9 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
     ]
     force, torque = model.sensor_objid[sensors].tolist()
     if force != torque:
-        sites = f"'{model.site(force).name}' and '{model.site(torque).name}'"
         raise RobotError(
-            f"robot.wrist: force and torque are sensed at two sites, {sites}, instead of one"
+            f"robot.wrist: force and torque are sensed at two sites, '{model.site(force).name}' and"
+            f" '{model.site(torque).name}', instead of one"
         )
     if not moved[model.site_bodyid[force]]:
         raise RobotError(

@@ -191,15 +191,16 @@ class ActuatorMonitor:
         if share[joint] <= min_share[joint]:
             self._cycles = 0
             return None
+        exerted = commanded[joint] - lacks[joint]
         if self._cycles == 0 or joint != self._joint:
             self._joint = joint
             self._cycles = 0
             self._commanded = commanded[joint]
-            self._exerted = commanded[joint] - lacks[joint]
+            self._exerted = exerted
             self._most_exerted = 0.0
             self._alone = True
         self._cycles += 1
-        self._most_exerted = max(self._most_exerted, abs(commanded[joint] - lacks[joint]))
+        self._most_exerted = max(self._most_exerted, abs(exerted))
         self._alone &= not rests and np.count_nonzero(np.abs(residual) > noise) == 1
         predicted_speed = np.abs(velocity) + 2.0 * np.abs(velocity - motors["earlier_velocity"])
         if (predicted_speed > self._fastest).any() or self._is_certain(
@@ -292,6 +293,5 @@ def compute_residuals(
         motor["earlier_velocity"] = motor["velocity"]
         motor["velocity"] = velocity[j]
         motor["bias"] = bias[j]
-        for k in range(len(motors)):
-            inertia_before[j, k] = inertia[j, k]
+    inertia_before[:] = inertia
     return verdict

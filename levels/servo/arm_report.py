@@ -52,13 +52,23 @@ class ArmReport:
         self._estimate = view_numbers(self.state, "position", "doubt").reshape(3, -1)
         self._written: tuple[object, ...] = ()  # fields in the last status that seldom change
 
-    def write_numbers(self, sensed: Sensed, wanted: Array) -> None:
-        """Write positions, velocities, torques and forces of this cycle.
+    def write_cycle(
+        self,
+        sensed: Sensed,
+        wanted: Array,
+        followed: SetPointStatus,
+        demand: Demand,
+        speed_scale: float,
+    ) -> None:
+        """Write the numbers of this cycle, and the other fields if one of them has changed.
 
         Args:
             sensed: Sample of this cycle, which gives the opening of the gripper.
             wanted: Motion wanted for the joints. Its first rows are positions, rad, and velocities,
                 rad/s.
+            followed: How the level follows its set points.
+            demand: Stop that the rack requires of the arm, if any.
+            speed_scale: Permitted fraction of full speed, up to 1.
         """
         joints = self._joints
         self._estimate[:] = self.sensors.estimate
@@ -66,15 +76,6 @@ class ArmReport:
         joints[2] = self.arm.torque
         joints[3:] = wanted[:2]
         self._gripper[:] = sensed.opening, sensed.opening_velocity, self.arm.grip_force
-
-    def write_fields(self, followed: SetPointStatus, demand: Demand, speed_scale: float) -> None:
-        """Write the other fields of the status if one of them has changed.
-
-        Args:
-            followed: How the level follows its set points.
-            demand: Stop that the rack requires of the arm, if any.
-            speed_scale: Permitted fraction of full speed, up to 1.
-        """
         arm = self.arm
         stopping = self.stopping
         fields = (

@@ -38,7 +38,7 @@ class DeadZone(Modification):
     def modify(self, sample: LawSample) -> None:
         """Move the position that the law uses towards the wanted one, by at most the width."""
         error = sample.wanted_position - sample.position
-        sample.position += np.minimum(np.maximum(error, -self._width), self._width)
+        sample.position += np.clip(error, -self._width, self._width)
 
 
 class JointPdParams(Table):

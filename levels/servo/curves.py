@@ -86,26 +86,17 @@ def set_motion(
     h = duration_s
     u = time_s / duration_s
     later = (time_s + ahead_s) / duration_s
-    moves = time_s < ends_s
-    accelerates = time_s + ahead_s < ends_s
+    motion[:] = 0.0
+    if not time_s < ends_s:
+        motion[0] = table[REST]
+        return
     for j in range(table.shape[1]):
-        if not moves:
-            motion[0, j] = table[REST, j]
-            motion[1, j] = 0.0
-            motion[2, j] = 0.0
-            continue
-        c0 = table[0, j]
-        c1 = table[1, j]
-        c2 = table[2, j]
-        c3 = table[3, j]
-        c4 = table[4, j]
-        c5 = table[5, j]
+        c0, c1, c2, c3, c4, c5 = table[:REST, j]
         motion[0, j] = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
         motion[1, j] = (c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
-        acceleration = (2.0 * c2 + later * (6.0 * c3 + later * (12.0 * c4 + later * 20.0 * c5))) / (
-            h * h
-        )
-        motion[2, j] = acceleration if accelerates else 0.0
+        if time_s + ahead_s < ends_s:
+            bend = 2.0 * c2 + later * (6.0 * c3 + later * (12.0 * c4 + later * 20.0 * c5))
+            motion[2, j] = bend / (h * h)
 
 
 class Bridge(Curve):

@@ -23,7 +23,8 @@ from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DriveState, Sensed, find_arm, preload
-from rack.levels.arm.link import Link
+from rack.levels.arm.guard import narrow_bounds_by_errors
+from rack.levels.errors import RobotError
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -102,10 +103,9 @@ class ArmDriver(Executor):
         self.cell = cell
         self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.speed_scale = robot.bring_up or 1.0  # reduced until the operator's release
-        self._path = self.arm.connect(
+        self._link = self.arm.connect(
             context.tick_s, self.speed_scale, self.acted, lambda: self.holds_part
         )
-        self._link: Link = self._path.faultless
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
@@ -139,8 +139,11 @@ class ArmDriver(Executor):
         kind = find_arm(reference)
         if not kind.keeps_limits:
             cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
-            if why := kind.find_connect_error(cell, robot.bring_up or 1.0):
-                yield "params.arm", reference, why
+            # `Arm.connect` would raise the same error.
+            try:
+                narrow_bounds_by_errors(cell, robot.bring_up or 1.0)
+            except RobotError as error:
+                yield "params.arm", reference, str(error)
         if robot.hand is not None:
             yield (
                 "executor",
@@ -175,8 +178,7 @@ class ArmDriver(Executor):
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults that are injected between this level and the arm."""
-        self._path.faulty.inject(faults)
-        self._link = self._path.faulty if faults else self._path.faultless
+        self._link.inject(faults)
 
     @abstractmethod
     def take_messages(self) -> None:
@@ -224,8 +226,9 @@ class ArmDriver(Executor):
         It is created in the first cycle, because the board provides the messages only after the
         constructor has run.
         """
-        parts = self.arm, self.sensors, self.stopping
-        return ArmReport(self.status, self.state, *parts, self.enabling.slow)
+        return ArmReport(
+            self.status, self.state, self.arm, self.sensors, self.stopping, self.enabling.slow
+        )
 
     def obey_drive_command(self, command: OperatorCommand) -> str:
         """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
@@ -263,8 +266,8 @@ class ArmDriver(Executor):
             self.motors.drop_cycle()
         self.arm.brake_cause = BRAKED_BY_DEMAND if self.demand else self.stopping.cause
         self.motors.torque[:] = self.arm.torque
-        self._report.write_numbers(sensed, self._wanted)
-        self._report.write_fields(self.report_set_points(reaction), self.demand, self.speed_scale)
+        followed = self.report_set_points(reaction)
+        self._report.write_cycle(sensed, self._wanted, followed, self.demand, self.speed_scale)
         self._orders.fill_status(self.status, self.rests_on)
         self.arm.save(self.state)
         self.stopping.save_state(self.state)
@@ -335,12 +338,8 @@ class ArmDriver(Executor):
             wanted.table, self.sensors.state, self.terms, self.holds_part
         )
         if failed is not None:
-            if not self.stopping.is_retrying:
-                self.findings.append(failed)
-            if (
-                self.stopping.register_motor_failure(failed.subject, failed.value, tick)
-                is Reaction.BRAKE
-            ):
+            on_failure = self.stopping.register_motor_failure(failed, tick)
+            if on_failure is Reaction.BRAKE:
                 return self.brake_arm()
         if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
             return self.brake_arm()

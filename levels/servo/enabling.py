@@ -45,8 +45,9 @@ class Enabling:
         self.is_started = self.is_taken_over = False
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
         self._command = f"rack command {context.rack} {context.board}"
-        speed = f"{robot.bring_up or 1.0:.0%} of full speed"
-        self.slow = f"{speed}; to end that: {self._command} release"
+        self.slow = (
+            f"{robot.bring_up or 1.0:.0%} of full speed; to end that: {self._command} release"
+        )
         self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
         self._restarted = False  # first cycle after a restart, in which old commands are read again
         self._serial = 0  # serial of the newest command while the drives carry it out, else 0

@@ -25,9 +25,15 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.errors import LevelError
-from rack.levels.level import OPERATOR, Input, LevelContext, Mismatches, Output, Verdict
+from rack.levels.level import OPERATOR, Input, LevelContext, Mismatches, Output
 from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
-from rack.levels.operator import DRIVE_OPERATIONS, Goal, Operation, OperatorCommand
+from rack.levels.operator import (
+    DRIVE_OPERATIONS,
+    HOLD_COMMANDS,
+    Goal,
+    Operation,
+    OperatorCommand,
+)
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.arm_report import SetPointStatus
@@ -69,8 +75,7 @@ class ServoLaw(ArmDriver):
     state = Output(ArmState)
     scene = SCENES
     commands = {
-        Operation.HOLD: (),
-        Operation.RESUME: (),
+        **HOLD_COMMANDS,
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),
@@ -92,9 +97,8 @@ class ServoLaw(ArmDriver):
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
         self._modified = ModifiedLaw(context, self.settings, self._limits, self.findings)
-        joints = context.robot.joints
         self.operator_control = OperatorControl(
-            self._orders, joints, cell.limits.position, obey=self._obey_command
+            self._orders, cell.joints, cell.limits.position, obey=self._obey_command
         )
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
@@ -129,11 +133,10 @@ class ServoLaw(ArmDriver):
 
     def take_messages(self) -> None:
         """Process the new messages of this cycle: operator's command, plan and set point."""
-        if self.operator.verdict is Verdict.NEW:
-            self.operator_control.take_commands(self.operator, self.sensors.position)
-        if self.plan.verdict is Verdict.NEW:
+        self.operator_control.take_commands(self.operator, self.sensors.position)
+        if self.plan.is_new:
             self.take_plan(self.plan.message)
-        if self.above.verdict is Verdict.NEW:
+        if self.above.is_new:
             command = self.above.message
             self.followed = command.id
             self.rests_on = command.operator
@@ -163,7 +166,7 @@ class ServoLaw(ArmDriver):
 
     def on_adopted(self) -> None:
         """Discard the operator's return path, because the arm may have been moved by hand."""
-        self.operator_control.forget_return_path()
+        self.operator_control.return_path.clear()
 
     def on_restored(self) -> None:
         """Keep the force of the gripper, so that a held part is not dropped."""
@@ -225,11 +228,12 @@ class ServoLaw(ArmDriver):
         torque = self._torque
         unlimited = self.torques(set_point, sensed)
         if getattr(unlimited, "shape", None) != torque.shape:
-            shapes = f"shape {np.shape(unlimited)}; expected {torque.shape}, one for each joint"
-            raise LevelError(f"class {type(self).__name__}: torques() returned {shapes}")
+            raise LevelError(
+                f"class {type(self).__name__}: torques() returned shape {np.shape(unlimited)};"
+                f" expected {torque.shape}, one for each joint"
+            )
         torque[:] = unlimited
-        if self._limit(torque, self._limits):
-            self._cut += 1
+        self._cut += self._limit(torque, self._limits)
         return torque
 
     def brake_arm(self) -> None:
@@ -240,16 +244,14 @@ class ServoLaw(ArmDriver):
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return the section of the status that reports on the set points."""
         operator = self.operator_control
-        stands = operator.is_in_control
-        cut = self.reference.refused + self._cut
-        reason = self.stopping.reason
-        if stands and not reason:
-            reason = operator.reason
-        holding = self.abandoned or self.reference.holding
-        stopped = self.abandoned or reaction > 0 or stands
-        note = self._modified.reason
         return SetPointStatus(
-            self.followed, holding, stopped, cut, reason, has_work=self.followed > 0, note=note
+            command=self.followed,
+            holding=self.abandoned or self.reference.holding,
+            stopped=self.abandoned or reaction > 0 or operator.is_in_control,
+            cut=self.reference.refused + self._cut,
+            reason=self.stopping.reason or operator.reason,
+            has_work=self.followed > 0,
+            note=self._modified.reason,
         )
 
 

@@ -140,9 +140,9 @@ class ModificationConfig(Table):
         hook = getattr(validate_class(reference, Modification), "hook", None)
         hooks = [str(hook) for hook in Hook]
         if hook not in hooks:
-            name = reference.partition(":")[2]
             raise ValueError(
-                f"class '{name}' has the hook {hook!r}; must be one of {', '.join(hooks)}"
+                f"class '{reference.partition(':')[2]}' has the hook {hook!r}; must be one of"
+                f" {', '.join(hooks)}"
             )
         return reference
 
@@ -150,14 +150,13 @@ class ModificationConfig(Table):
     def _check_params(self) -> ModificationConfig:
         """Check the params against the table of parameters that the class declares."""
         kind = self.kind.params
-        if kind is None:
-            if self.params:
-                raise ValueError(f"'{self.cls.partition(':')[2]}' takes no params; remove them")
-            return self
-        try:
-            read_params(kind, self.params)
-        except LevelError as error:
-            raise ValueError(str(error)) from None
+        if kind is not None:
+            try:
+                read_params(kind, self.params)
+            except LevelError as error:
+                raise ValueError(str(error)) from None
+        elif self.params:
+            raise ValueError(f"'{self.cls.partition(':')[2]}' takes no params; remove them")
         return self
 
     @property

@@ -14,7 +14,7 @@ in the same sample, with the same smooth change of the torque.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,18 +56,15 @@ class ModificationState:
             Why the modification failed, or an empty string if it did not.
         """
         original = changed.copy()
-        failure = ""
         try:
             if self.begins:
                 self.begins = False
                 self.modification.begin(sample)
             self.modification.modify(sample)
+            failure = "" if np.isfinite(changed).all() else "its result is not finite"
         # Code of users may raise any exception.
         except Exception as error:
             failure = f"{type(error).__name__}: {error}"
-        else:
-            if not np.isfinite(changed).all():
-                failure = "its result is not finite"
         if failure:
             changed[:] = original
         return failure
@@ -138,7 +135,7 @@ class ModifiedLaw:
         if is_on != state.is_on or state.name in self._failed:
             self._failed.pop(state.name, None)
             if is_on and state.modification.hook == Hook.INSTEAD:
-                for other in self._list_hooked(Hook.INSTEAD):
+                for other in self._instead:
                     other.is_on = False
             state.is_on = state.begins = is_on
             self._update_hooks()
@@ -184,7 +181,7 @@ class ModifiedLaw:
             self._difference[:] = self._last - torque
         if self._since is not None:
             torque = self._blend_torque(torque, tick - self._since)
-        np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # keeps NaN
+        np.clip(torque, -self._torque, self._torque, out=self._last)  # keeps NaN
         self._is_driving = True
         return self._last
 
@@ -214,15 +211,13 @@ class ModifiedLaw:
             return torque
         return torque + (1.0 - passed) ** 2 * (1.0 + 2.0 * passed) * self._difference
 
-    def _list_hooked(self, hook: Hook) -> Sequence[ModificationState]:
-        """Return the active modifications that declare `hook`, in the order of the config."""
-        return [state for state in self._in if state.modification.hook == hook]
-
     def _update_hooks(self) -> None:
         """Group the active modifications by hook, and list them and the failed ones in `reason`."""
-        self._in = [state for state in self._all.values() if state.is_on]
-        self._before, self._instead, self._after = (self._list_hooked(hook) for hook in Hook)
+        active = [state for state in self._all.values() if state.is_on]
+        self._before, self._instead, self._after = (
+            [state for state in active if state.modification.hook == hook] for hook in Hook
+        )
         self._switched = True
         failed = [f"modification '{name}' taken out: {why}" for name, why in self._failed.items()]
-        active = [f"modified by {', '.join(state.name for state in self._in)}"] if self._in else []
-        self.reason = "; ".join(failed + active)
+        names = ", ".join(state.name for state in active)
+        self.reason = "; ".join(failed + [f"modified by {names}"] * bool(names))

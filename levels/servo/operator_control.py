@@ -30,6 +30,8 @@ class OperatorControl:
     Attributes:
         orders: Commands of the operator and the answers to them.
         is_in_control: True if the level follows the operator instead of the level above.
+        return_path: Positions from which the operator moved the arm, oldest first, (joints,) each,
+            rad. Without them, motion continues from the present position.
     """
 
     def __init__(
@@ -60,8 +62,7 @@ class OperatorControl:
         # (joints,), rad: position of the arm at the newest command.
         self._position = np.zeros(len(joints))
         self._goal: Array | None = None  # (joints,), rad
-        # (joints,), rad each: positions from which the operator moved the arm, oldest first.
-        self._return_path: list[Array] = []
+        self.return_path: list[Array] = []
 
     def take_commands(self, operator: Reading[OperatorCommand], position: Array) -> None:
         """Accept the operator's new commands.
@@ -73,13 +74,9 @@ class OperatorControl:
         self._position[:] = position
         if not self.orders.take_commands(operator, self._process_command):
             return
-        if not self.orders.is_in_force and self._return_path:
+        if not self.orders.is_in_force and self.return_path:
             self.orders.report_under_way()
-        self.is_in_control = self.orders.is_in_force or bool(self._return_path)
-
-    def forget_return_path(self) -> None:
-        """Discard the return path, so that motion continues from the present position."""
-        self._return_path.clear()
+        self.is_in_control = self.orders.is_in_force or bool(self.return_path)
 
     @property
     def reason(self) -> str:
@@ -109,8 +106,8 @@ class OperatorControl:
         """Return the motion wanted at `tick`, from the operator or, else, from the set points."""
         if not self.is_in_control:
             return reference.compute_motion(tick)
-        returns = self._return_path and not self.orders.is_in_force
-        goal = self._return_path[-1] if returns else None
+        returns = self.return_path and not self.orders.is_in_force
+        goal = self.return_path[-1] if returns else None
         if self.orders.standing is Operation.SETPOINT:
             goal = self._goal
         if goal is None:
@@ -119,12 +116,12 @@ class OperatorControl:
             before = reference.goal
             motion = reference.move_to(goal, tick)
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
-                self._return_path.append(motion.position.copy())
+                self.return_path.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
             # The motion has arrived at its goal.
             if returns:
-                self._return_path.pop()
-            if self.orders.is_in_force or not self._return_path:
+                self.return_path.pop()
+            if self.orders.is_in_force or not self.return_path:
                 self.is_in_control = self.orders.is_in_force
                 self.orders.report_done()
         return motion

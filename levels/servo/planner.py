@@ -22,15 +22,8 @@ class ServoPlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_level_cell(context)
-        self._dynamics = Dynamics(cell)
-        self._home = cell.home
-        self._objects = len(cell.object_qpos)
-        bodies = cell.bodies[: self._objects]
-        self._masses = cell.model.body_subtreemass[bodies].copy()
-        self._centres = cell.model.body_ipos[bodies].copy()
-        self._rotation = np.zeros(9)
-        self._rest = np.zeros(len(cell.home))
+        self._cell = build_level_cell(context)
+        self._dynamics = Dynamics(self._cell)
 
     def wanted(self, tick: int) -> bool:
         """Return True, because the inertia changes whenever the arm moves."""
@@ -41,16 +34,18 @@ class ServoPlanner(Planner):
         command = self.above.message
         held = -1
         payload = Payload(0.0, np.zeros(3))
-        if command.due != 0 and self.scene.has_message and 0 <= command.held < self._objects:
+        objects = len(self._cell.object_qpos)
+        if command.due != 0 and self.scene.has_message and 0 <= command.held < objects:
             held = command.held
             payload = self._compute_payload(self.scene.message, held)
         # Use the next set point, else the sensed position, or home before the first status.
-        position = self._home
+        position = self._cell.home
         if command.due != 0 and np.isfinite(command.position).all():
             position = command.position
         elif self.status.has_message:
             position = self.status.message.position
-        self.output.inertia = self._dynamics.terms(position, self._rest, payload).inertia
+        terms = self._dynamics.terms(position, np.zeros_like(position), payload)
+        self.output.inertia = terms.inertia
         self.output.held = held
         self.output.payload_mass = payload.mass
         self.output.payload_offset = payload.offset
@@ -65,8 +60,12 @@ class ServoPlanner(Planner):
         Returns:
             Mass, kg, and its centre in the frame of the tool, m.
         """
-        mujoco.mju_quat2Mat(self._rotation, scene.quaternion[held])
-        centre = scene.position[held] + mat_vec(self._rotation.reshape(3, 3), self._centres[held])
-        mujoco.mju_quat2Mat(self._rotation, scene.tool_quaternion)
-        offset = transposed_mat_vec(self._rotation.reshape(3, 3), centre - scene.tool_position)
-        return Payload(float(self._masses[held]), offset)
+        model = self._cell.model
+        body = self._cell.bodies[held]
+        turned = np.zeros(9)
+        rotation = turned.reshape(3, 3)
+        mujoco.mju_quat2Mat(turned, scene.quaternion[held])
+        centre = scene.position[held] + mat_vec(rotation, model.body_ipos[body])
+        mujoco.mju_quat2Mat(turned, scene.tool_quaternion)
+        offset = transposed_mat_vec(rotation, centre - scene.tool_position)
+        return Payload(float(model.body_subtreemass[body]), offset)

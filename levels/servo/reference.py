@@ -59,10 +59,7 @@ class Reference:
         """
         self._limits = limits
         self._tick_s = tick_s
-        self._half_s = 0.5 * tick_s
-        self._low, self._high = bounds.position.T.copy()
-        self._fastest = bounds.velocity
-        self._hardest = MAX_ACCELERATION * limits.acceleration
+        self._bounds = bounds
         joints = len(limits.velocity)
         # The wanted motion, and its difference from the curve.
         self._motions = np.zeros((2, 3, joints))
@@ -180,8 +177,8 @@ class Reference:
         command = self._command
         if command is None:
             return
-        position = np.clip(command.position, self._low, self._high)
-        velocity = np.clip(command.velocity, -self._fastest, self._fastest)
+        position = np.clip(command.position, *self._bounds.position.T)
+        velocity = np.clip(command.velocity, -self._bounds.velocity, self._bounds.velocity)
         is_near = (due - tick) * self._tick_s <= MAX_AHEAD_S
         if is_near and np.isfinite((command.position, command.velocity)).all():
             self._next = SetPoint(due, position, velocity)
@@ -206,7 +203,7 @@ class Reference:
         begin = tick if self.holding else self._due
         begin_s = (begin - self._from) * self._tick_s
         curve = Bridge(self._curve, begin_s, (position, velocity), (due - begin) * self._tick_s)
-        if not self.holding and curve.is_within(self._hardest):
+        if not self.holding and curve.is_within(MAX_ACCELERATION * self._limits.acceleration):
             self._curve = curve
             self._from = begin
             self._due = due
@@ -248,7 +245,7 @@ class Reference:
         difference = self._difference
         wanted = self._wanted
         time_s = (tick - self._from) * self._tick_s
-        half_s = self._half_s
+        half_s = 0.5 * self._tick_s
         self._interpolate(curve.table, curve.duration_s, curve.ends_s, time_s, half_s, wanted.table)
         if difference is not None:
             time_s = (tick - self._differs_from) * self._tick_s

@@ -66,10 +66,7 @@ class Stopping:
         self._joints = joints
         self._params = params
         self._every = every
-        self._on_sensors = Reaction[params.on_sensor_fault.upper()]
-        self._on_motors = Reaction[params.on_actuator_fault.upper()]
         self._retry_ticks = round(params.retry / tick_s)
-        self._good_ticks = params.good_cycles * every
         self._patience_ticks = max(round(params.patience / tick_s), every)
         self.refused: Finding | None = None
         self.error = Error.NONE
@@ -81,7 +78,7 @@ class Stopping:
         self._tick: int | None = None
         # Tick at which a failed motor is retried. None if no motor has failed.
         self._retry_at: int | None = None
-        self._on_failure = self._on_motors  # reaction until the retry
+        self._on_failure = Reaction.BRAKE  # reaction until the retry
         self._motor = self._blow = Cause(Error.NONE, "")
         self._struck_until: int | None = None  # tick until which a struck arm stays stopped
         self._on_blow = Reaction.BRAKE  # reaction until that tick
@@ -108,28 +105,24 @@ class Stopping:
         """True if the arm is not enabled, and no fault has a higher priority."""
         return self.cause in (Error.DISABLED, Error.DRIVES)
 
-    @property
-    def is_retrying(self) -> bool:
-        """True while a motor is at fault, or has not worked long enough since its retry."""
-        return self._retry_at is not None
-
-    def register_motor_failure(self, joint: int, lacking: float, tick: int) -> Reaction:
-        """Register a failed motor.
+    def register_motor_failure(self, failed: Finding, tick: int) -> Reaction:
+        """Register a failed motor. Its finding is reported unless the motor is being retried.
 
         Args:
-            joint: Joint of the motor.
-            lacking: Torque that it did not give, N m.
+            failed: Finding that names the joint of the motor, and the torque in N m that it lacks.
             tick: Tick of the cycle.
 
         Returns:
             The reaction of this cycle.
         """
-        self._on_failure = self._on_motors if self._retry_at is None else Reaction.BRAKE
+        self._on_failure = Reaction.BRAKE
+        if self._retry_at is None:
+            self._on_failure = Reaction[self._params.on_actuator_fault.upper()]
+            self.findings.append(failed)
         self._retry_at = tick + self._retry_ticks
-        text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
-        self._motor = Cause(
-            Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}"
-        )
+        text = f"motor of '{self._joints[failed.subject]}' does not give the torque commanded"
+        then = f"; tried again at tick {self._retry_at}"
+        self._motor = Cause(Error.MOTORS, text, failed.subject, failed.value, then)
         self._set_cause(self._motor, tick)
         return self._on_failure
 
@@ -187,12 +180,6 @@ class Stopping:
             self.cause = Error.NONE
         if self.error:
             return Reaction.BRAKE
-        is_sound = self.refused is None and self._retry_at is None and self._struck_until is None
-        if is_sound and not (sensors.faulty or demand):
-            self._fault_ticks = max(self._fault_ticks - passed, 0) if self._fault_ticks else 0
-            self.cause = Error.NONE
-            self.reason = ""
-            return Reaction.NONE
         reaction, cause = self._select_reaction(sensors, tick)
         if cause is None:
             self._fault_ticks = max(self._fault_ticks - passed, 0)
@@ -214,7 +201,7 @@ class Stopping:
         else:
             self.cause = Error.NONE
             self.reason = ""
-        return max(reaction, Reaction[demand.name]) if demand else reaction
+        return max(reaction, Reaction[demand.name])
 
     def _set_cause(self, cause: Cause, tick: int) -> None:
         """Set `cause` and `reason`, which contains the tick at which the fault will be latched."""
@@ -227,10 +214,12 @@ class Stopping:
         reaction = Reaction.NONE
         cause = None if self.refused is None else self._describe_refusal(self.refused)
         if sensors.faulty:
-            reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
+            reaction = Reaction.BRAKE
+            if sensors.drivable:
+                reaction = Reaction[self._params.on_sensor_fault.upper()]
             cause = self._describe_sensor_fault(sensors)
         if self._retry_at is not None:
-            if tick >= self._retry_at + self._good_ticks:
+            if tick >= self._retry_at + self._params.good_cycles * self._every:
                 self._retry_at = None
             else:
                 on_motors = self._on_failure if tick < self._retry_at else Reaction.HOLD
@@ -254,11 +243,12 @@ class Stopping:
 
     def _describe_refusal(self, refused: Finding) -> Cause:
         """Describe a refused torque or set point as the cause of a stop."""
-        value = (
-            "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
-        )
-        text = f"rejected: torque of '{self._joints[refused.subject]}' is {value}"
-        if refused.alarm is Alarm.SET_POINT:
+        quantity = "torque"
+        value = f"{refused.value:.3g} N m"
+        if refused.alarm is Alarm.COMMAND_INVALID:
+            value = "not finite"
+        elif refused.alarm is Alarm.SET_POINT:
+            quantity = "set point"
             value = f"{refused.value:.3g} rad from the joint"
-            text = f"rejected: set point of '{self._joints[refused.subject]}' is {value}"
+        text = f"rejected: {quantity} of '{self._joints[refused.subject]}' is {value}"
         return Cause(Error.LIMIT, text, refused.subject, refused.value)

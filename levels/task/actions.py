@@ -120,7 +120,8 @@ def rehearse_goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     ends = [
         (tool, q)
         for tool in tools
-        for q in motion.ik.find_free_solutions(tool, rehearsal.q, motion.checker.is_free)
+        for q in motion.ik.find_solutions(tool, rehearsal.q)
+        if motion.checker.is_free(q)
     ]
     if not ends:
         raise _explain_unreachable(motion, tools, rehearsal.q)
@@ -286,7 +287,8 @@ class TransferPlanner(NamedTuple):
         situation.apply_to(motion.checker, None)
         restarts = LEANING_RESTARTS if is_leaning(tool) else MAX_RESTARTS
         over = tool.raise_by(self.lift)
-        above = motion.ik.find_free_solutions(over, self.start.q, motion.checker.is_free, restarts)
+        above = motion.ik.find_solutions(over, self.start.q, restarts=restarts)
+        above = [q for q in above if motion.checker.is_free(q)]
         situation.apply_to(motion.checker, self.row)
         ends = [(q, motion.ik.find_configuration(tool, q)) for q in above]
         free = [(q, end) for q, end in ends if end is not None and motion.checker.is_free(end)]

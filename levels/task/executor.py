@@ -71,9 +71,10 @@ class TaskExecutor(Executor):
             for k in range(done, len(self._actions)):
                 by_s = self._actions[k].by
                 if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
-                    why = f", {self._actions[k]}, was not done by {by_s:g} s"
                     self._error = Error.TOO_LATE
-                    self._reason = self._format_reason(k, why)
+                    self._reason = self._format_reason(
+                        k, f", {self._actions[k]}, was not done by {by_s:g} s"
+                    )
         self._done = self._interrupt_program(plan, below)
         waits = self._find_reason_to_wait(self.below)
         if self._compute_state(plan) == State.EXECUTING:
@@ -117,7 +118,7 @@ class TaskExecutor(Executor):
             self._error = Error(plan.error)
             self._reason = plan.reason
         elif plan.count and not self._detour.move:
-            self._done = min(max(self._done, self._window.count_done(below)), plan.count)
+            self._done = min(max(self._done, below.done - self._window.first + 1), plan.count)
         failed = below.state == State.ERROR and below.done >= self._window.before
         if failed and not self._detour.move and self._done < plan.count:
             action = int(plan.moves["action"][self._done])
@@ -150,11 +151,13 @@ class TaskExecutor(Executor):
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
         """Report an error if nothing has moved for too long, unless an operator prevents motion."""
         below = self.below.message
-        reported = below.done, below.planned, below.current, below.progress
         progress = (
             plan.id,
             self._done,
-            *reported,
+            below.done,
+            below.planned,
+            below.current,
+            below.progress,
             self._detour.move,
             *self._list_progress_values(),
         )
@@ -184,8 +187,9 @@ class TaskExecutor(Executor):
     def _hand_down_moves(self, plan: TaskPlan, command: TaskCommand) -> None:
         """Show the program's next moves, or the operator's goto, to the level below."""
         detour = self._detour
-        if detour.move and detour.is_known and not self._error:
-            self._window.show_only(detour.to_move(self._count_done_actions(plan)), command)
+        goto = detour.to_move(self._count_done_actions(plan))
+        if detour.move and goto is not None and not self._error:
+            self._window.show_only(goto, command)
         else:
             is_stopped = self._error or detour.move
             until = 0 if is_stopped else self._find_first_barred_move(plan)

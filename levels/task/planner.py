@@ -16,8 +16,6 @@ from rack.levels.robot.cell import build_level_cell
 from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
 from rack.levels.task.rehearsal import Rehearsal, Rehearsed, compute_finish_times
 
-FIRST_PLAN_ID = 1
-"""Serial of the first plan."""
 MAX_REST_M_S = 0.01
 """Speed below which an object is at rest, so that motions to it can be planned."""
 
@@ -50,7 +48,7 @@ class TaskPlanner(Planner):
         from rack.levels.planning.motion_planner import MotionPlanner
 
         self._program = self._read_first_program()
-        self._id = FIRST_PLAN_ID
+        self._id = 1  # serial of the plan
         self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
         self._motion = MotionPlanner(build_level_cell(context), context.scene, context.seed)
         self._plan: TaskPlan | None = None  # plan made by this process
@@ -73,7 +71,7 @@ class TaskPlanner(Planner):
             return False
         if self._plan is not None:
             return True
-        if not (self.servo.has_message and self.world.has_message and self.world.message.revision):
+        if not (self.servo.has_message and self.world.message.revision):
             return False
         objects = len(self.context.scene.objects)
         speeds = np.linalg.norm(self.world.message.velocity[:objects], axis=1)
@@ -84,7 +82,7 @@ class TaskPlanner(Planner):
 
         If this process has already planned the program, the same plan is published again.
         """
-        self._visible_at = tick + self._planning_ticks
+        self._visible_at = tick + self.context.within_cycles * self.context.every
         if self._plan is not None:
             self.output.copy_from(self._plan)
             return
@@ -102,11 +100,6 @@ class TaskPlanner(Planner):
         """Return the reason why the program is refused, with the number of the action if known."""
         return str(refused) if refused.action is None else f"action {refused.action}, {refused}"
 
-    @property
-    def _planning_ticks(self) -> int:
-        """Number of ticks that the computation of a plan may take."""
-        return self.context.within_cycles * self.context.every
-
     def _may_be_unacknowledged(self, tick: int, since: int) -> bool:
         """Return True while the executor may not have had time to acknowledge a published plan.
 
@@ -117,7 +110,8 @@ class TaskPlanner(Planner):
             # The status acknowledges a plan one cycle after it becomes visible.
             return tick <= self._visible_at + self.context.every
         # A plan published just before a restart of this planner becomes visible later.
-        return self.made.message.id == self._id or 0 < since <= tick < since + self._planning_ticks
+        planning_ticks = self.context.within_cycles * self.context.every
+        return self.made.message.id == self._id or 0 < since <= tick < since + planning_ticks
 
     def _decompose_program(self, tick: int) -> None:
         """Rehearse the program and write its moves into `output`. Raises `Refused`."""
@@ -175,5 +169,8 @@ class TaskPlanner(Planner):
             earliest_s = finished_s + self._ahead_s
             if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
                 self.output.earliest = earliest_s
-                text = f"{action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
-                raise Refused(Error.TOO_LATE, text, move.action)
+                raise Refused(
+                    Error.TOO_LATE,
+                    f"{action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s",
+                    move.action,
+                )

@@ -117,7 +117,7 @@ def compute_finish_times(
             # The planner computes one plan at a time. It needs another cycle only if it has to wait
             # for the move.
             planned_s = max(planned_s, shown_s + below_s) + below_s * pace.within_cycles
-        ready_s = max(planned_s, shown_s) if move.is_motion else shown_s
+        ready_s = planned_s if move.is_motion else shown_s
         space_s = done_s[k - SEGMENTS] + below_s if k >= SEGMENTS else 0.0
         arrival_s = max(ready_s, space_s) + 2.0 * below_s
         previous_s = done_s[-1] if done_s else 0.0

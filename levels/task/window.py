@@ -58,10 +58,6 @@ class ShownWindow:
         self.first = self.newest + ID_JUMP - done
         self.before = self.first + done - 1
 
-    def count_done(self, below: MoveStatus) -> int:
-        """Return the number of the plan's moves that the level below reports as done."""
-        return below.done - self.first + 1
-
     def find_interruption(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
         """Find the move before which the program can be interrupted.
 
@@ -134,19 +130,13 @@ class Detour:
         self.holds = False  # True while the arm must come to rest before the interruption
         self.until: int | None = None  # first move of the program that must not begin
 
-    @property
-    def is_known(self) -> bool:
-        """True if the goal is known.
-
-        The goal is lost if this board is restarted after a hold has followed the goto.
-        """
-        return self._target is not None
-
     def format_reason(self) -> str:
         """Return text that describes the state of the goto and the command that ends it."""
-        goal = describe_command(Operation.GOTO, self._goal)
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
-        return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
+        return (
+            f"diverted by the operator: {describe_command(Operation.GOTO, self._goal)} {stage};"
+            " `resume` continues the program"
+        )
 
     def accept_command(self, message: OperatorCommand, is_new: bool) -> None:
         """Accept a goto, or refuse an invalid one. If `is_new` is False, its move keeps its id."""
@@ -201,13 +191,14 @@ class Detour:
             return done if is_free_motion(plan, done) else done - 1
         return done
 
-    def to_move(self, action: int) -> Move:
-        """Return the goto as an elemental move. Call this only if `is_known`.
+    def to_move(self, action: int) -> Move | None:
+        """Return the goto as an elemental move, or None if its goal is not known.
 
-        `action` is the number of the program's next action, although the move does not belong to
-        it.
+        The goal is lost if this board is restarted after a hold has followed the goto. `action` is
+        the number of the program's next action, although the move does not belong to it.
         """
-        assert self._target is not None, "there is a move only for a goal"
+        if self._target is None:
+            return None
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 

@@ -17,10 +17,10 @@ from tests.levels.arms import CLOCK_NS, cell, config
 
 
 def build_link(
-    *faults: Fault, **held: Callable[[], bool]
+    *faults: Fault, holds: Callable[[], bool] = bool
 ) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
     arm, acted = SimulatedArm(cell("puma560"), config("puma560")[1], CLOCK_NS), dict[int, bool]()
-    link = FaultyLink(arm, acted, **held)
+    link = FaultyLink(arm, acted, arm, holds)
     link.inject(faults)
     return link, arm, acted
 

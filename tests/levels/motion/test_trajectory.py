@@ -86,7 +86,7 @@ def test_motion_rests_at_every_stop_of_the_path_and_no_stop_overruns_it() -> Non
     last = np.array([0.8, 0, 0, 0, 0, 0.4])
     path = BlendedPath([np.zeros(6), np.full(6, 0.4), last], np.zeros(3))
     trajectory = make_trajectory(path, ARM)
-    s, ds, _ = trajectory.evaluate_states(np.linspace(0.0, trajectory.duration, 20_001))
+    s, ds, *_ = trajectory.evaluate_states(np.linspace(0.0, trajectory.duration, 20_001))
     assert path.stops
     assert np.abs(ds[np.argmin(np.abs(s - path.stops[0]))]) < 0.02
     assert ds.max() > 0.5

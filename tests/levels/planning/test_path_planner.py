@@ -43,8 +43,8 @@ def sides(puma: Cell, checker: CollisionChecker) -> Sides:
     """Configurations low on either side of the wall."""
     ik = InverseKinematics(puma, SEED)
     poses = (make_pose((0.5, y, 0.6), DOWN) for y in (0.3, -0.2))
-    left = ik.find_free_solutions(next(poses), puma.home, checker.is_free)[0]
-    return left, ik.find_free_solutions(next(poses), left, checker.is_free)[0]
+    left = next(filter(checker.is_free, ik.find_solutions(next(poses), puma.home)))
+    return left, next(filter(checker.is_free, ik.find_solutions(next(poses), left)))
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ class PressRig(ArmRig):
         ]
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
         pose = make_pose((FREE_M, 0.0, 0.75), FORWARD)
-        self._near = ik.find_free_solutions(pose, np.array(robot.home), lambda q: True)[0]
+        self._near = ik.find_solutions(pose, np.array(robot.home))[0]
         robot = robot.model_copy(update={"home": tuple(self._near)})
         cell = build_cell(robot, scene, CLOCK_NS)
         outside = {"level.command": JointReference}

@@ -44,7 +44,7 @@ class HybridRig:
         robot, scene = pad(folder)
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
         near, pose = np.array(robot.home), make_pose(start, DOWN)
-        (home, *_) = ik.find_free_solutions(pose, near, lambda q: True)
+        (home, *_) = ik.find_solutions(pose, near)
         robot = robot.model_copy(update={"home": tuple(home)})
         self.cell, self.ik = build_cell(robot, scene, CLOCK_NS), ik
         places = {"above": "trajectory", "below": "servo"}
