@@ -55,7 +55,12 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
     ] == rows
     assert ("late: level" in shown.stdout) == (name in ("fig3", "fig4-overload"))
     assert (tmp_path / "out" / "gantt.png").read_bytes().startswith(b"\x89PNG")
-    assert ElementTree.parse(tmp_path / "out" / "gantt.svg").getroot().tag.endswith("svg")
+    picture = (tmp_path / "out" / "gantt.svg").read_text()
+    assert ElementTree.fromstring(picture).tag.endswith("svg")
+    # matplotlib draws letters as shapes, and names each text in a comment.
+    drawn = re.findall(r"<!-- (.+?) -->", picture)
+    assert {name, "time, ms"} <= {*drawn}
+    assert ("missed deadline" in drawn) == (name in ("fig3", "fig4-overload"))
     assert str(tmp_path / "out" / "gantt.png") in shown.stdout
 
 
@@ -70,8 +75,7 @@ def test_the_rows_of_a_large_rack_are_not_wrapped_and_its_times_are_written_in_f
     lanes = [line for line in shown if line.startswith("core ")]
     assert len(lanes) == 6
     assert all(re.fullmatch(r"core \d  \w+ +[A-Z.-]{40,76}", line) for line in lanes)
-    # matplotlib draws letters as shapes, and names each text in a comment. They are far enough
-    # apart.
+    # They are far enough apart.
     labels = re.findall(r"<!-- ([\d.+e]+) -->", (tmp_path / "gantt.svg").read_text())
     assert labels == ["100000", "100020", "100040"]
 

@@ -14,7 +14,7 @@ from tests.levels.robot import grippers
 from tests.tools.robot.models import urdf, written
 
 pytestmark = pytest.mark.slow
-MOTOR = '<position name="grip_right" joint="finger_right" forcerange="-15 15"/>'
+MOTOR = '<position name="grip_right" joint="finger_right" {}/>'
 
 
 def drafted(folder: Path, model: Path) -> Draft:
@@ -32,13 +32,25 @@ def test_an_uncoupled_finger_follows_as_a_guess(tmp_path: Path) -> None:
     assert "right_finger follow" in made.guessed["gripper"]
 
 
-def test_one_drive_closes_a_hand_of_two_with_the_force_of_both(tmp_path: Path) -> None:
-    fingers = grippers.sides(grippers.SLIDE)
-    robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", actuator=MOTOR)
+@pytest.mark.parametrize(
+    ("stated", "force"),
+    [
+        ('forcerange="-15 15"', 15.0),
+        # Without a stated force it presses with 20 N besides its friction.
+        ("", 20.0 + 3.0),
+    ],
+)
+def test_one_drive_closes_a_hand_of_two_with_the_force_of_both(
+    tmp_path: Path, stated: str, force: float
+) -> None:
+    fingers = grippers.sides(grippers.SLIDE.replace("damping", 'frictionloss="3" damping'))
+    motor = MOTOR.format(stated)
+    robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", actuator=motor)
     gripper = gripper_of(drafted(tmp_path, robot.model))
     assert gripper.follow == (FollowConfig(joint="finger_right", ratio=1.0),)
     assert (gripper.actuator, gripper.joint) == ("grip", "finger_left")
-    assert gripper.force == 40.0 + 15.0
+    # The other finger states 60 N, but presses with at most 40 N besides its friction.
+    assert gripper.force == 40.0 + 3.0 + force
 
 
 def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: Path) -> None:

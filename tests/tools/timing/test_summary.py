@@ -38,6 +38,7 @@ def test_the_verdict_of_a_rack_that_fits_is_followed_by_a_bar_per_core() -> None
     assert [line[: len(start)] for line, start in zip(found, starts, strict=False)] == [*starts]
     bar = "core 1  [###############.]  98.6%"
     assert found[3] == f"{bar}  servo 51%, task.planner 43%, servo.planner 5%"
+    assert found[4] == "tightest: core 1, load: 0.986 of 1, 1% left"
     assert found[5] == "response: a command down 1282.5 ms, a status up 2280 ms"
     assert found[-1] == MORE
     assert len(found) <= 10

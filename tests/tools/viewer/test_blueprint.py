@@ -17,7 +17,7 @@ from rack.levels.messages import ServoStatus
 from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.tools.viewer.blueprint import CYCLES, MAX_LANES, RackViews
 from rack.tools.viewer.cell import MarkWriter, write_geometry
-from rack.tools.viewer.levels import name_lanes
+from rack.tools.viewer.levels import COLUMN, ROW, compute_positions, name_lanes
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, open_recording
 from rack.tools.viewer.style import LOST
@@ -137,6 +137,25 @@ def test_no_lane_is_cut_off_and_higher_boards_are_above_lower_ones(name: str | P
     assert [lane.partition("-")[2] for lane in numbered][: sum(map(len, ranks))] == [
         board for rank in ranks for board in rank
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [
+        ("nasrem", {"servo": (0, 3), "servo.planner": (1, 3), "task": (0, 0), "world": (-1, 0)}),
+        ("rccl", {"joint3": (2, 2), "joint4": (0, 3), "arm": (0, 4), "world": (-1, 0)}),
+        ("hic", {"grasp": (0, 0), "world": (-1, 0), "events": (-1, 1)}),
+    ],
+)
+def test_the_graph_has_ranks_in_rows_and_other_boards_to_their_left(
+    name: str, places: dict[str, tuple[int, int]]
+) -> None:
+    config = load(name)
+    layout = resolve_layout(config)
+    found = compute_positions(layout, build_rack_timing(config, layout))
+    assert found.keys() == {task.name for task in layout.tasks}
+    for task, (column, row) in places.items():
+        assert found[task] == (column * COLUMN, row * ROW), task
 
 
 def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@ from given times."""
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from rack.boards import OneProcess
 from rack.boards.config import RackConfig, load
 from rack.tools.lab.benches.apart import run_in_board_environment
 from rack.tools.lab.benches.harness import Sample
-from rack.tools.lab.benches.lockstep import WITHOUT_RACK, build_comparison
+from rack.tools.lab.benches.lockstep import WITHOUT_RACK, build_comparison, run_bare
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
@@ -37,6 +39,12 @@ def read_newest(config: RackConfig, ticks: int) -> dict[str, Any]:
     with OneProcess(config) as rack:
         rack.run_ticks(ticks)
         return {name: rack.newest(name).record[()].copy() for name in rack.serials}
+
+
+def test_the_time_of_bare_levels_is_processor_time_in_seconds(small: Path) -> None:
+    config = load(small, ["clock.mode=lockstep"])
+    start_s = time.process_time()
+    assert 0.0 < run_bare(config, 40) < time.process_time() - start_s
 
 
 def test_speeds_follow_from_times_and_the_ratios_from_the_baseline() -> None:

@@ -59,6 +59,8 @@ def test_the_numbers_of_frames_stand_above_their_columns() -> None:
     margin = frames.index("|")
     for number in (0, 2, 36):
         assert frames[margin + 2 * number :].startswith(f"|{number}")
+    within = build_panel("cyclic", 50.0, 150.0).frames
+    assert list(within.items()) == [(n, 4 * n * NS_PER_MS) for n in range(13, 38)]
 
 
 def test_a_chart_in_letters_names_tasks_that_are_too_short_for_its_columns() -> None:
