@@ -15,10 +15,12 @@ from collections.abc import Callable
 
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.faulty import FaultyLink
-from rack.levels.arm.guard import GuardedArm
+from rack.levels.arm.guard import GuardedArm, narrow_bounds_by_errors
 from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.arm.link import Link
+from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
+from rack.levels.robot.cell import Cell
 from rack.levels.tables import SensorConfig
 
 
@@ -74,6 +76,18 @@ class Arm(BrakedArm):
         """Set the fraction of the velocity limits that the link permits."""
         if self._guard is not None:
             self._guard.permit_speed(speed_fraction)
+
+    @classmethod
+    def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
+        """Return the reason why `connect` would fail for a cell, or an empty string.
+
+        Called before the launch.
+        """
+        try:
+            narrow_bounds_by_errors(cell, speed_fraction)
+        except RobotError as error:
+            return str(error)
+        return ""
 
     def look(self, scene: Scene) -> None:
         """Fill a `Scene` with the sensed poses of bodies and tool.

@@ -23,8 +23,6 @@ from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DriveState, Sensed, find_arm, preload
-from rack.levels.arm.guard import narrow_bounds_by_errors
-from rack.levels.errors import RobotError
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -139,11 +137,8 @@ class ArmDriver(Executor):
         kind = find_arm(reference)
         if not kind.keeps_limits:
             cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
-            # `Arm.connect` would raise the same error.
-            try:
-                narrow_bounds_by_errors(cell, robot.bring_up or 1.0)
-            except RobotError as error:
-                yield "params.arm", reference, str(error)
+            if why := kind.find_connect_error(cell, robot.bring_up or 1.0):
+                yield "params.arm", reference, why
         if robot.hand is not None:
             yield (
                 "executor",
