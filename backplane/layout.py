@@ -267,6 +267,10 @@ class Layout:
     mailboxes: tuple[MailboxSpec, ...]
     hosts: tuple[TaskSpec, ...] = ()
 
+    def to_ticks(self, seconds: float) -> int:
+        """Convert simulated time in s to ticks."""
+        return round(seconds * 1e9 / self.clock_ns)
+
     @property
     def processes(self) -> tuple[TaskSpec, ...]:
         """All tasks, followed by the host boards. Each runs as one process."""

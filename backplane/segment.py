@@ -395,6 +395,11 @@ class Segment:
         return True
 
     @property
+    def tick(self) -> int:
+        """The newest tick of the clock."""
+        return self.words[System.TICK]
+
+    @property
     def run_is_over(self) -> bool:
         """True if the run has ended normally, or the launcher has ended."""
         return self.words[System.STATE] == Run.STOPPED or not self.launcher_is_alive

@@ -255,7 +255,7 @@ class Journal:
         if tick is None:
             tick = -1
             if self.segment is not None and self.segment.words[System.STATE] != Run.STARTING:
-                tick = self.segment.words[System.TICK]
+                tick = self.segment.tick
         self.record_event(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
 
     def record_event(self, event: Event) -> None:
@@ -439,7 +439,7 @@ class Ending:
         """
         assert self._observer is not None, "some level ends the run"
         state = self._observer.peek().message.state
-        ticks = self._segment.words[System.TICK]
+        ticks = self._segment.tick
         return 0 < self._longest <= ticks and state not in (State.DONE, State.ERROR)
 
     def _compute_silent_ticks(self) -> int:
@@ -453,7 +453,7 @@ class Ending:
         if reading.message.state in (State.DONE, State.ERROR):
             return 0
         newest = self._observer.newest if reading.has_message else 0
-        ticks = self._segment.words[System.TICK] - newest
+        ticks = self._segment.tick - newest
         return ticks if ticks > self._silent else 0
 
 

@@ -2,7 +2,7 @@
 
 A handler at the reading board serves one message at a time. A message is sent at an instant that is
 computed, not measured: the release of the writing cycle plus the worst-case response of its task
-(`rack.boards.config.sending`), or plus one tick if there is no budget. A plan is sent at the end of
+(`rack.boards.config.layout`), or plus one tick if there is no budget. A plan is sent at the end of
 its time slice. At the reading board a message joins the `Inbox`. A level can read it at the level's
 first release at or after the end of its service. If too many messages wait at a board, the message
 is lost at that board only.

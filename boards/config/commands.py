@@ -44,7 +44,7 @@ def describe_commands(level: PublishedLevel) -> str:
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
         wording = (what.name.lower(), names, format_goals(goals))
-        words.append(" ".join(word for word in wording if word))
+        words.append(" ".join(filter(None, wording)))
     return ", ".join(words)
 
 
@@ -106,7 +106,7 @@ def _encode_request(command: CommandConfig, layout: Layout) -> Request:
     return Request(
         layout.find_mailbox_index(name),
         bytes(message.raw),
-        compute_first_tick(command, layout.clock_ns),
+        compute_first_tick(command, layout),
     )
 
 
@@ -171,10 +171,9 @@ def _check_command(
     if command.joints is not None and Goal.JOINTS in known[command.operation]:
         yield from _check_joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
-        if getattr(command, key) is not None and not any(getattr(command, key)):
-            yield Mistake(
-                at(key), list(getattr(command, key)), "all zero; its length must not be zero"
-            )
+        value = getattr(command, key)
+        if value is not None and not any(value):
+            yield Mistake(at(key), list(value), "all zero; its length must not be zero")
 
 
 def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:

@@ -262,11 +262,10 @@ class Wiring:
     @cached_property
     def operator_mailboxes(self) -> list[str]:
         """Mailboxes through which an operator commands levels."""
-        classes = find_executors(self.config).items()
         is_any = names_scheduler(self.config)
         return [
             f"{board}.operator"
-            for board, kind in classes
+            for board, kind in find_executors(self.config).items()
             if is_any or has_operator_port(kind) or self.config.board[board].standby
         ]
 
@@ -275,11 +274,6 @@ class Wiring:
         """Message type of every mailbox."""
         written = {name: output.message.message_type for name, (_, output) in self.writers.items()}
         return written | dict.fromkeys(self.operator_mailboxes, OperatorCommand.message_type)
-
-    @property
-    def mailbox_names(self) -> str:
-        """Names of all mailboxes, separated by commas, for error texts."""
-        return ", ".join(self.types)
 
     @cached_property
     def mailboxes_from_host(self) -> set[str]:

@@ -147,12 +147,11 @@ def list_names(folder: Path = CONFIGS) -> list[str]:
     """
     rack_names = [path.stem for path in folder.glob("*.toml")]
     for main in (path for path in folder.glob("*/*.toml") if path.stem == path.parent.name):
-        racks = [
-            path.stem
+        rack_names += [
+            main.stem if path == main else f"{main.stem}/{path.stem}"
             for path in main.parent.glob("*.toml")
             if path == main or "name" in _read_tables(path)
         ]
-        rack_names += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
     return sorted(rack_names)
 
 

@@ -84,11 +84,9 @@ class FaultCheck:
                 )
         fault = self.fault
         config = self.config
-        tasks: dict[str, Role] = {
-            **{place.name: place.role for place in (*config.list_tasks(), *config.list_hosts())},
-            # Whatever strikes an executor strikes its standbys too.
-            **{place.name: "executor" for place in config.list_standbys()},
-        }
+        tasks = {place.name: place.role for place in (*config.list_tasks(), *config.list_hosts())}
+        # Whatever strikes an executor strikes its standbys too.
+        tasks |= {place.name: "executor" for place in config.list_standbys()}
         kind = KINDS.names.get(fault.kind)
         if kind is None:
             yield self._build_mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
@@ -309,12 +307,12 @@ def _build_injection(
     if fault.cycles is not None:
         ticks = fault.cycles * cycle_ticks(layout, fault.board)
     elif fault.lasts is not None:
-        ticks = max(1, round(fault.lasts * 1e9 / layout.clock_ns))
+        ticks = max(1, layout.to_ticks(fault.lasts))
     return Injection(
         kind=kind.number,
         task=-1 if fault.board == CLOCK else names.index(fault.board),
         mailbox=mailbox,
-        tick=compute_first_tick(fault, layout.clock_ns),
+        tick=compute_first_tick(fault, layout),
         ticks=ticks,
         phase=int(fault.phase * PHASES),
         seed=seed,

@@ -23,6 +23,7 @@ from rack.backplane.message_type import MessageType
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.protocols import UNREAD
 from rack.boards.config.schema import RackConfig, TaskEntry
+from rack.boards.config.timing import build_rack_timing
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox. Few are needed, because commands are rare."""
@@ -36,6 +37,8 @@ SUSTAINED = 4
 
 A recorder can keep up with this rate. The limit saves memory.
 """
+NEVER = 1 << 62
+"""A response in ns without a bound. The message is then sent at the end of the cycle."""
 WORD_BYTES = 4
 """Bytes of one word in `[protocol.interrupt]`, the width of the 68020's bus."""
 NS_PER_US = 1e3
@@ -84,23 +87,52 @@ class LayoutBuilder:
     Args:
         wiring: The wiring.
         sizes: Sizes that messages use by name, such as the number of joints.
-
-    Attributes:
-        sent_ns: Times from a release to the sending of interrupts, by executor. For others it is
-            the budget of a cycle, or one tick without a budget.
     """
 
     def __init__(self, wiring: Wiring, sizes: Mapping[str, int]) -> None:
         self._wiring = wiring
         self._config = wiring.config
         self._sizes = sizes
-        self.sent_ns = {
+        # Times from a release to the sending of interrupts, by executor. For others it is the
+        # budget of a cycle, or one tick without a budget.
+        self._sent_ns = {
             name: round(board.budget.send_within_ms * NS_PER_MS)
             for name, board in wiring.config.board.items()
             if board.budget and board.budget.send_within_ms
         }
         self._retained_ticks = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
         self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.ports.values()}
+
+    def settle_sending(self) -> Layout:
+        """Return the layout of a config without mistakes, with the instants of sending interrupts.
+
+        A receiver counts with an instant at which a message is in memory: the worst-case response
+        of its writer. Responses include the handlers that preempt a task, and a handler runs when a
+        message is sent. The instants are therefore raised, from the budgets on, until each is at
+        least the response that follows from all of them, or the end of the cycle. Any such instants
+        are kept: as long as all earlier messages were in memory in time, handlers run and cycles
+        end as computed.
+
+        A board with `budget.send_within_ms` sends at that time, whether or not its response keeps
+        it.
+        """
+        fixed = {*self._sent_ns}
+        # The instants are simulated times, which do not depend on the speed.
+        clock = self._config.clock.model_copy(update={"speed": 1.0})
+        config = self._config.model_copy(update={"clock": clock})
+        while True:
+            layout = self.build_layout()
+            senders = {
+                box.writer: box.interrupt.sent_ns
+                for box in layout.mailboxes
+                if box.interrupt and box.writer not in fixed
+            }
+            before_ns = dict(self._sent_ns)
+            for task in build_rack_timing(config, layout).responses if senders else ():
+                if task.task in senders:
+                    self._sent_ns[task.task] = max(senders[task.task], task.response_ns or NEVER)
+            if self._sent_ns == before_ns:
+                return layout
 
     def build_layout(self) -> Layout:
         """Return the layout with all tasks, host boards and mailboxes of the segment."""
@@ -112,14 +144,7 @@ class LayoutBuilder:
         ]
         # Standbys follow all other tasks, whose indices therefore do not depend on them.
         standbys = [
-            replace(
-                self._tasks[place.board],
-                name=place.name,
-                role=place.role,
-                slot=place.slot,
-                core=find_core(place.core),
-                priority=place.priority,
-            )
+            self._build_task(place)
             for place in self._config.list_standbys()
             if place.board in self._tasks
         ]
@@ -234,7 +259,7 @@ class LayoutBuilder:
         sent_ns = writer.slice * clock_ns
         if writer.role != "planner":
             busy_ns = round(self._config.board[writer.board].busy_ms * NS_PER_MS) or clock_ns
-            sent_ns = min(self.sent_ns.get(writer.name, busy_ns), sent_ns)
+            sent_ns = min(self._sent_ns.get(writer.name, busy_ns), sent_ns)
         slots = tuple(sorted({task.slot for task in readers} - uninterrupted - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
         interrupt = InterruptSpec(

@@ -31,7 +31,6 @@ from rack.boards.config.schedulers import (
     compute_clock_reservation,
 )
 from rack.boards.config.schema import LAN, RackConfig
-from rack.boards.config.sending import settle_sending
 from rack.boards.config.timing import is_critical
 from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
@@ -137,7 +136,8 @@ class Resolved:
         config = self.config
         clock = config.clock
         ends_run = self.ends_run
-        silent = self._to_ticks(SILENT_S)
+        to_ticks = self.layout.to_ticks
+        silent = to_ticks(SILENT_S)
         if ends_run is not None:
             writer = self.layout.find_mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.find_task(writer).every)
@@ -153,22 +153,20 @@ class Resolved:
         return ClockWiring(
             lockstep=config.is_lockstep,
             period_ns=config.tick_ns,
-            stop_tick=0 if seconds is None else max(1, self._to_ticks(seconds)),
+            stop_tick=0 if seconds is None else max(1, to_ticks(seconds)),
             ends_run=ends_run,
-            linger=self._to_ticks(LINGER_S),
+            linger=to_ticks(LINGER_S),
             silent=silent,
-            longest=self._to_ticks(config.supervision.lockstep_end_s) * config.is_lockstep,
-            history=self._to_ticks(AHEAD_S),
+            longest=to_ticks(config.supervision.lockstep_end_s) * config.is_lockstep,
+            history=to_ticks(AHEAD_S),
             core=core,
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
             reservation=compute_clock_reservation(config),
-            schedulings={
-                **{t.task: t.scheduling for t in self.tasks if t.scheduling is not None},
-                **build_clock_scheduling(config),
-            },
+            schedulings={t.task: t.scheduling for t in self.tasks if t.scheduling is not None}
+            | build_clock_scheduling(config),
             copy=None if clock.standby is None else 0,
-            restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
+            restart_ticks=max(1, to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
 
@@ -182,8 +180,7 @@ class Resolved:
         if standby is None:
             return {}
         priority = wiring.priority if standby.priority is None else standby.priority
-        core = self.clock_cores[1]
-        return {CLOCK_STANDBY: replace(wiring, core=core, priority=priority, copy=1)}
+        return {CLOCK_STANDBY: replace(wiring, core=self.clock_cores[1], priority=priority, copy=1)}
 
     @cached_property
     def clock_cores(self) -> tuple[int, ...]:
@@ -194,10 +191,6 @@ class Resolved:
         """
         places = self.config.clock, self.config.clock.standby
         return tuple(find_core(place.core) for place in places if place is not None)
-
-    def _to_ticks(self, seconds: float) -> int:
-        """Convert simulated time in s to ticks."""
-        return round(seconds * 1e9 / self.config.clock_ns)
 
     @property
     def ends_run(self) -> str | None:
@@ -259,9 +252,7 @@ class Examination:
             self.mistakes += (unknown_sizes := [*check_sizes(wiring, self._sizes)])
             if not unknown_sizes:
                 builder = LayoutBuilder(wiring, self._sizes)
-                self._layout = (
-                    builder.build_layout() if self.mistakes else settle_sending(config, builder)
-                )
+                self._layout = builder.build_layout() if self.mistakes else builder.settle_sending()
                 self._contexts = self._build_board_contexts(wiring)
                 self.mistakes += check_memory(self._layout)
                 self.mistakes += check_neighbours(wiring, self._contexts)
@@ -270,8 +261,7 @@ class Examination:
         self.mistakes += find_fault_mistakes(
             faults, config, levels, self._layout, wiring.unknown_boards
         )
-        broken_boards = self._wiring.broken_boards
-        self.mistakes += find_command_mistakes(commands, config, levels, broken_boards)
+        self.mistakes += find_command_mistakes(commands, config, levels, self._wiring.broken_boards)
         if (network := load_network_rules(config)) is not None:
             self.mistakes = [network.move_to_adapter(mistake, config) for mistake in self.mistakes]
 

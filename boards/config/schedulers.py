@@ -88,14 +88,13 @@ def build_clock_scheduling(config: RackConfig) -> dict[str, Scheduling]:
     if not cost_ns:
         return {}
     clock = config.clock
-    switch_ns = round(2 * config.timing.context_switch_ms * NS_PER_MS)
     scheduling = Scheduling(
         clock.core,
         clock.priority,
         find_clock_scheduler(config),
         is_critical=True,
         cost_ns=cost_ns,
-        switch_ns=switch_ns,
+        switch_ns=round(2 * config.timing.context_switch_ms * NS_PER_MS),
         locked_ns=0,
         ceiling=0,
         reservation=None,

@@ -333,11 +333,6 @@ class TaskEntry(NamedTuple):
         return f"{'host' if self.role == 'host' else 'board'}.{self.board}"
 
     @property
-    def class_key(self) -> str:
-        """Key of the task's table that names the class of the task."""
-        return {"host": "program", "standby": "executor"}.get(self.role, self.role)
-
-    @property
     def reads_key(self) -> str:
         """Key of the task's table that connects its inputs to mailboxes of the user's choice."""
         return "planner_reads" if self.role == "planner" else "reads"

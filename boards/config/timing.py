@@ -40,8 +40,6 @@ def build_rack_timing(
     measured = read_budgets(config) if measured is None else measured
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
-    parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
-    goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS
     schedule = None if config.schedule is None else compute_frames(config.schedule, config.clock_ns)
     return RackTiming(
         is_lockstep=config.is_lockstep,
@@ -54,7 +52,7 @@ def build_rack_timing(
             config.clock.core,
             config.clock.priority,
             config.tick_ns,
-            parts,
+            (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else (),
             scheduler=find_clock_scheduler(config),
             is_critical=True,
         ),
@@ -64,7 +62,7 @@ def build_rack_timing(
         },
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
-        response_goal_ns=goal_ns,
+        response_goal_ns=None if goal_ms is None else goal_ms * NS_PER_MS,
         inboxes=build_inboxes(layout),
         schedule=schedule,
     )
@@ -81,11 +79,10 @@ def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
     for slot in dict.fromkeys(task.slot for task in layout.tasks):
         if boxes := layout.list_interrupting_mailboxes(slot):
             name = layout.find_interrupt_task(slot)
-            names = tuple(box.name for box in boxes)
             task = layout.find_task(name)
             timings[name] = InboxTiming(
                 name,
-                names,
+                tuple(box.name for box in boxes),
                 list_sources(layout, slot),
                 get_interrupt_spec(boxes[0]).depth,
                 period_ns=task.slice * layout.clock_ns,
@@ -118,7 +115,6 @@ def _build_board_timing(
     board = config.board[name]
     within_ms = None if board.budget is None else board.budget.plan_within_ms
     within_ns = None if within_ms is None else round(within_ms * NS_PER_MS)
-    planner_core = board.core if board.planner_core is None else board.planner_core
     return BoardTiming(
         name=name,
         above=tuple(upper for upper, lower in config.list_links() if lower == name),
@@ -128,7 +124,7 @@ def _build_board_timing(
         within_cycles=board.within_cycles,
         core=board.core,
         priority=board.priority,
-        planner_core=planner_core,
+        planner_core=board.core if board.planner_core is None else board.planner_core,
         planner_priority=board.planner_priority,
         has_planner=board.planner is not None,
         is_critical=is_critical(config, layout, name),
@@ -161,10 +157,10 @@ def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
     return grids
 
 
-def compute_first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
+def compute_first_tick(entry: CommandConfig | FaultConfig, layout: Layout) -> int:
     """Return the first tick at which a command or fault is due. -1 if it is due at once."""
     if entry.at is not None:
-        return round(entry.at * 1e9 / clock_ns)
+        return layout.to_ticks(entry.at)
     return -1 if entry.tick is None else entry.tick
 
 

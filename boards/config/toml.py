@@ -185,11 +185,10 @@ def remove_tables(tables: Tables, broken: frozenset[str]) -> Tables:
     """Return tables without those that `broken` names, as in "robot" or "board.servo"."""
     remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):
-        named = remaining.get(key, {})
         # For a name with a dot, as in board."a.b", `broken` contains only "board.a".
         remaining[key] = {
             name: table
-            for name, table in named.items()
+            for name, table in remaining.get(key, {}).items()
             if find_table_name(f"{key}.{name}") not in broken
         }
     return remaining

@@ -253,8 +253,7 @@ class JoinedRacks:
             if (link := self.crossings.get((sender, receiver))) is None:
                 response_ns += compute_grid_wait(written, self.find_grid(receiver, sender.board))
             else:
-                is_lockstep = self.racks[receiver.rack].is_lockstep
-                response_ns += link.compute_taken_ns(written, is_lockstep)
+                response_ns += link.compute_taken_ns(written, self.racks[receiver.rack].is_lockstep)
                 response_ns += link.compute_shown_ns(self.find_grid(receiver, LINK_BOARD))
         return response_ns
 

@@ -124,14 +124,9 @@ class LevelTiming:
     plan_within_ns: int | None
 
     @property
-    def interlevel_ns(self) -> int:
-        """t_interlevel of eq. 3.9: reading and writing commands and statuses, R + W."""
-        return self.read_ns + self.write_ns
-
-    @property
     def communication_ns(self) -> int:
         """t_comm of eq. 3.5: communication of the executor in every cycle, R + W + C."""
-        return self.interlevel_ns + self.exchange_ns
+        return self.read_ns + self.write_ns + self.exchange_ns
 
     @property
     def executor_planner_ns(self) -> int:

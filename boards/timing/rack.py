@@ -15,7 +15,7 @@ from rack.boards.timing.chains import ParallelChains, list_chains
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, LevelTiming
 from rack.boards.timing.response_time import TaskResponse, compute_loads, compute_task_responses
-from rack.boards.timing.tasks import Part, TimedTask, Unit
+from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 
 
 class CyclicSchedule(NamedTuple):
@@ -156,29 +156,6 @@ class RackTiming:
                 longest |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
         return longest
 
-    def build_level(self, board: str) -> LevelTiming:
-        """Return the timing of a board's level. Raises `KeyError` if the board has no budget."""
-        table = self.boards[board]
-        budget = table.budget
-        if budget is None:
-            raise KeyError(board)
-        has_plan = table.is_plan_budgeted
-        plan_ns = budget.plan_ns + self.compute_interrupted_ns(f"{board}.planner")
-        return LevelTiming(
-            board=board,
-            coupling=table.coupling,
-            cycle_ns=table.every * self.tick_ns,
-            longest_cycle_ns=round(self.longest_cycles[board] * self.tick_ns),
-            read_ns=budget.read_ns,
-            execution_ns=budget.process_ns + self.compute_interrupted_ns(board),
-            write_ns=budget.write_ns,
-            exchange_ns=table.exchange_ns,
-            plan_ns=plan_ns if has_plan else None,
-            update_ns=budget.update_ns if has_plan else 0,
-            within_cycles=table.within_cycles if has_plan else None,
-            plan_within_ns=table.plan_within_ns if has_plan else None,
-        )
-
     def compute_interrupted_ns(self, task: str) -> int:
         """Return the time in ns that interrupts take from one computation of a task.
 
@@ -212,10 +189,29 @@ class RackTiming:
     def levels(self) -> dict[str, LevelTiming]:
         """Timing of every level that has a budget, keyed by board."""
         return {
-            name: self.build_level(name)
+            name: self._build_level(board, board.budget)
             for name, board in self.boards.items()
             if board.budget is not None
         }
+
+    def _build_level(self, board: BoardTiming, budget: Budget) -> LevelTiming:
+        """Return the timing of the level of a board with this budget."""
+        has_plan = board.is_plan_budgeted
+        plan_ns = budget.plan_ns + self.compute_interrupted_ns(f"{board.name}.planner")
+        return LevelTiming(
+            board=board.name,
+            coupling=board.coupling,
+            cycle_ns=board.every * self.tick_ns,
+            longest_cycle_ns=round(self.longest_cycles[board.name] * self.tick_ns),
+            read_ns=budget.read_ns,
+            execution_ns=budget.process_ns + self.compute_interrupted_ns(board.name),
+            write_ns=budget.write_ns,
+            exchange_ns=board.exchange_ns,
+            plan_ns=plan_ns if has_plan else None,
+            update_ns=budget.update_ns if has_plan else 0,
+            within_cycles=board.within_cycles if has_plan else None,
+            plan_within_ns=board.plan_within_ns if has_plan else None,
+        )
 
     @cached_property
     def tasks(self) -> tuple[TimedTask, ...]:
@@ -257,7 +253,6 @@ class RackTiming:
         executors = [executor, *(replace(executor, **s._asdict()) for s in board.standbys)]
         if not board.has_planner:
             return executors
-        ceiling = board.priority if board.is_critical else 0
         planner = replace(
             executor,
             name=f"{board.name}.planner",
@@ -271,7 +266,7 @@ class RackTiming:
             within_cycles=board.within_cycles,
             due_ns=0,
             scheduler=Scheduler.FIXED_PRIORITY,
-            ceiling=ceiling,
+            ceiling=board.priority if board.is_critical else 0,
         )
         return [*executors, planner]
 

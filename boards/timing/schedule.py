@@ -187,7 +187,7 @@ class _TaskSimulation:
         # turn.
         self._queued_at = task.phase_ns
         self._turn_ns = TURN_NS
-        self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []
+        self._switch = Part(None, context_switch_ns)
         # Remaining steps of the job, and the time already spent on the first of them.
         self._steps: list[Part] = []
         self._spent_ns = 0
@@ -259,8 +259,8 @@ class _TaskSimulation:
         if self.task.role != "planner":
             self._ends |= dict.fromkeys(range(self.ready_at, self._release, every))
         self._slack_ns = self.task.period_ns - every
-        steps = [part for part in self.task.parts if part.time_ns]
-        self._steps = [*self._switch, *steps, *self._switch]
+        steps = [self._switch, *self.task.parts, self._switch]
+        self._steps = [step for step in steps if step.time_ns]
 
     def _find_release(self, now_ns: int) -> int:
         """Return the release that a job takes which begins at a time."""

@@ -44,12 +44,11 @@ class CoreJob:
     def get_urgency(self, now_ns: int) -> Urgency:
         """Return its urgency at a time. Of equal jobs, the one released first runs."""
         is_locked = self.left_ns < self.locked_ns
-        laxity_ns = self.deadline_ns - now_ns - self.left_ns
         urgency = compute_urgency(
             self.scheduler,
             max(self.priority, self.ceiling) if is_locked else self.priority,
             self.deadline_ns,
-            laxity_ns,
+            self.deadline_ns - now_ns - self.left_ns,
             is_critical=self.is_critical,
         )
         return *urgency, not is_locked, max(self.ready_at, self.turn_at), self.task

@@ -53,15 +53,7 @@ def compute_execution_ns(rows: TraceRows) -> Values:
 
 def compute_communication_ns(rows: TraceRows) -> Values:
     """Return t_comm of eq. 3.5: the duration of each cycle minus its execution, in ns."""
-    return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
-
-
-def compute_residual_ns(rows: TraceRows, due_ns: int) -> Values:
-    """Return t_residual: the time in ns from the end of each cycle to its deadline.
-
-    It is negative if the deadline was missed. The deadline is `due_ns` after the release.
-    """
-    return np.asarray(rows["release_ns"] + due_ns - rows["end_ns"])
+    return np.asarray(compute_duration_ns(rows) - compute_execution_ns(rows))
 
 
 def compute_gaps_ns(rows: TraceRows, stretches: Values | None = None) -> Values:

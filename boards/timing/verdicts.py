@@ -179,17 +179,15 @@ def _check_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator
         meaning = "d R_i <= budget.plan_within_ms"
         yield EquationVerdict(PLAN_WITHIN, board, level.slice_ns, "<=", within_ns, meaning)
     if level.coupling == "loose":
-        time_slice = level.slice_ns
         yield EquationVerdict(
-            LOOSE_PLAN, board, level.planning_ns, "<=", time_slice, "t_plan <= d R_i"
+            LOOSE_PLAN, board, level.planning_ns, "<=", level.slice_ns, "t_plan <= d R_i"
         )
         return
     share = level.planning_ns / level.within_cycles
     left = level.residual_ns - 2 * switch_ns
     yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
     # The worst cycle also contains the update of the plan.
-    communication = level.interlevel_ns + level.executor_planner_ns
-    used = level.execution_ns + communication + 2 * switch_ns
+    used = level.execution_ns + level.communication_ns + level.update_ns + 2 * switch_ns
     meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
     yield EquationVerdict("3.9", board, used, "<", cycle, meaning)
     update = level.executor_planner_ns / cycle

@@ -13,7 +13,6 @@ from contextlib import closing
 import numpy as np
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.levels.references import find_class
 from rack.tools.console.answer import Failure
 from rack.tools.monitor.polling import poll_run
@@ -96,7 +95,7 @@ def _show_run(bridge: RackBridge, segment: Segment) -> None:
         # Begin with the present, not with the two seconds that the rings still hold.
         ring.read_new_rows()
     for _ in poll_run(segment, PERIOD_S):
-        tick = segment.words[System.TICK]
+        tick = segment.tick
         for name, ring in rings.items():
             if len(rows := ring.read_new_rows().rows):
                 bridge.show_rows(name, rows)

@@ -53,7 +53,7 @@ class TopicBridge(RackBridge):
         folder = find_run_folder(segment)
         self._events = None if folder is None else EventFile(folder / "events.jsonl")
         self._cycles: dict[str, list[np.ndarray]] = {task.name: [] for task in layout.tasks}
-        self._second = max(1, round(DIAGNOSTICS_S * 1e9 / layout.clock_ns))
+        self._second = max(1, layout.to_ticks(DIAGNOSTICS_S))
 
     @abstractmethod
     def advertise(self, topic: str, kind: str) -> Publisher:

@@ -114,7 +114,7 @@ def check(
     fitting = find_repair(judged)
     if fix:
         _print_repaired_config(fitting, as_json)
-        if fitting.remaining_failures:
+        if fitting.end.failures:
             sys.exit(1)
         return
     core_warnings = list_replaced_cores(rack_config)
@@ -153,7 +153,7 @@ def check(
             *rack_config.format_notes,
             *core_warnings,
             *format_summary(forecast, arm, rack_config.joints),
-            *format_fixes(fixes, fitting.remaining_failures),
+            *format_fixes(fixes, fitting.end.failures),
             *forecast.notes,
         ]
         if verbose:
@@ -246,7 +246,7 @@ def _compute_abilities(config: RackConfig) -> Abilities | None:
 
 def _print_repaired_config(fitting: Repair, as_json: bool) -> None:
     """Print the repaired config on stdout and its changes on stderr, or both as JSON."""
-    failures = fitting.remaining_failures
+    failures = fitting.end.failures
     config = None if failures else fitting.end.config.to_toml_text()
     if as_json:
         print_json(fitting.to_document() | {"config": config})

@@ -58,8 +58,9 @@ def gantt(
     chart = build_gantt(
         drawn_subject, WindowOptions(from_ns, to_ns), create_reading_progress(silent=as_json)
     )
-    if chart.span_count > MANY_SPANS and not as_json:
-        print(f"drawing {chart.span_count} spans", file=sys.stderr, flush=True)
+    span_count = sum(len(panel.chart.spans) for panel in chart.panels)
+    if span_count > MANY_SPANS and not as_json:
+        print(f"drawing {span_count} spans", file=sys.stderr, flush=True)
     pictures = chart.save_pictures(_create_folder(drawn_subject.folder)) if can_draw() else []
     _print_chart(chart.format_text(), chart.to_document(), pictures, as_json)
 

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import create_console, format_fitted_records
@@ -55,7 +54,7 @@ def mailbox(
     messages = ring.read_new_rows().rows
     if not len(messages):
         raise Failure(f"mailbox '{name}' has no message yet")
-    newest = formatter.to_document(messages[-1], segment.words[System.TICK])
+    newest = formatter.to_document(messages[-1], segment.tick)
     print_answer(newest, formatter.format_lines(newest), as_json)
 
 
@@ -77,7 +76,7 @@ def _watch_mailbox(
     rows = ring.read_new_rows().rows[-1:]
     with live or nullcontext():
         for _ in poll_run(segment, look_s):
-            tick = segment.words[System.TICK]
+            tick = segment.tick
             documents = [
                 formatter.to_document(row, tick) for row in (*rows, *ring.read_new_rows().rows)
             ]

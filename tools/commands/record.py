@@ -9,7 +9,6 @@ from shutil import copyfile
 from threading import Event
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.boards.config.layout import RETAINED_S
 from rack.tools.commands.replay import merge_runs
 from rack.tools.console.answer import Document, Failure, print_answer
@@ -72,9 +71,9 @@ def record(
             print_answer(*_save_recording(segment, folder), as_json)
             return
         clock_ns = segment.layout.clock_ns
-        first_tick = max(0, segment.words[System.TICK] - round(RETAINED_S * 1e9 / clock_ns))
+        first_tick = max(0, segment.tick - round(RETAINED_S * 1e9 / clock_ns))
         notes = _record_run(segment, folder, view)
-        lasted_s = (segment.words[System.TICK] - first_tick) * clock_ns * 1e-9
+        lasted_s = (segment.tick - first_tick) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
     answer = {

@@ -11,7 +11,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.boards.faults.config import parse_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
@@ -86,9 +85,7 @@ def watch(
         return
     check_writable(out or Path(f"{rack}.csv"))
     trigger = Trigger.parse(when, boxes)
-    ticks_before, ticks_after = (
-        round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
-    )
+    ticks_before, ticks_after = map(segment.layout.to_ticks, (before_s, after_s))
     strip = SignalHistory(segment, shown_signals, ticks_before + ticks_after, [trigger.signal])
     tick = await_trigger(segment, strip, trigger, ticks_after)
     path = out or Path(f"{rack}-{tick}.csv")
@@ -129,9 +126,9 @@ def _show_signals(
     segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool
 ) -> None:
     """Show signals until the run is over."""
-    span = round(PLOT_SPAN_S * 1e9 / segment.layout.clock_ns)
+    span = segment.layout.to_ticks(PLOT_SPAN_S)
     strip = SignalHistory(segment, signals, span)
-    first = segment.words[System.TICK]
+    first = segment.tick
     show_until = build_printer(strip, first, round(every_s / strip.tick_s), as_json)
     terminal = create_console()
     with ExitStack() as stack:
@@ -146,7 +143,7 @@ def _show_signals(
         for is_over in poll_run(segment, READ_INTERVAL_S):
             strip.read_new()
             settles = 0 if is_over else strip.settling_ticks
-            show_until(segment.words[System.TICK] - settles)
+            show_until(segment.tick - settles)
     if strip.lost:
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
@@ -172,7 +169,7 @@ def await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, af
         if tick < 0:
             holding_ticks = rows["tick"][trigger.evaluate_messages(rows["message"])]
             tick = next(iter(holding_ticks.tolist()), -1)
-        if tick >= 0 and segment.words[System.TICK] > tick + after + history.settling_ticks:
+        if tick >= 0 and segment.tick > tick + after + history.settling_ticks:
             break
     if tick < 0:
         why = "was interrupted" if INTERRUPT.number else "the run is over"

@@ -87,10 +87,6 @@ class Interrupt:
         finally:
             self._reactions.pop()
 
-    def end_at_once(self) -> AbstractContextManager[None]:
-        """End the process in the signal handler at a signal, even inside `stop_orderly`."""
-        return self.stop_orderly(self.end_process)
-
     def raise_interrupted(self) -> AbstractContextManager[None]:
         """Raise `Interrupted` at the first signal.
 

@@ -236,7 +236,7 @@ class RosEncoder:
 
     def _count_intervals(self, rows: Rows, seconds: float) -> Rows:
         """Return the number of whole intervals of simulated time before each row."""
-        return np.asarray(rows["tick"] // max(1, round(seconds * 1e9 / self._layout.clock_ns)))
+        return np.asarray(rows["tick"] // max(1, self._layout.to_ticks(seconds)))
 
 
 def list_frames(model: mujoco.MjModel) -> list[str]:

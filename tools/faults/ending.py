@@ -104,10 +104,9 @@ class ArmEnd:
 
 def list_strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
     """Return all faults that were injected into a rack, in the order of the fault table."""
-    entries = FaultTable(segment).entries
     return tuple(
         build_strike(entry, segment.layout, joints)
-        for entry in entries
+        for entry in FaultTable(segment).entries
         if entry.stage != Stage.FREE
     )
 
@@ -133,7 +132,6 @@ def build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> St
     board = find_board(entry, layout)
     began = -1 if entry.stage == Stage.WAITING else entry.tick
     joint = to_integer(values.get("joint", -1))
-    joint_name = joints[joint] if 0 <= joint < len(joints) else ""
     return Strike(
         fault=entry.index,
         kind=kind.name,
@@ -145,7 +143,7 @@ def build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> St
         count=entry.count,
         hidden=entry.hidden,
         mailboxes=tuple(box.name for box in list_affected_mailboxes(layout, entry.mailbox, board)),
-        joint=joint_name,
+        joint=joints[joint] if 0 <= joint < len(joints) else "",
         size=values.get("size"),
         injection=Injection(
             kind=entry.kind,

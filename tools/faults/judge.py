@@ -152,7 +152,7 @@ class Judge:
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._last = max((event.tick for event in events), default=0)
-        self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
+        self._settle = run.layout.to_ticks(SETTLE_S)
 
     def judge_all(self) -> FaultVerdict:
         """Return the judgement of each fault, and the events that no fault explains."""
@@ -162,10 +162,9 @@ class Judge:
         for index, strike in enumerate(self._strikes):
             last = windows[index][1]
             later = self._strikes[index + 1 :]
-            detections = self._list_detections(strike, last, used)
             own_detections = [
                 detection
-                for detection in detections
+                for detection in self._list_detections(strike, last, used)
                 if not self._is_in_time_for_later(detection, later)
             ]
             # Reactions belong to this fault until the next fault acts, or until the end of this

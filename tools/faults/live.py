@@ -42,7 +42,6 @@ class LiveRack:
         self._config = read_stored(segment.config)
         self._levels = PublishedRack.read_from_segment(segment).levels
         self._table = FaultTable(segment)
-        self._joints = self._config.joints
 
     def inject_fault(
         self, settings: Mapping[str, Any], wait: bool, timeout_s: float | None = None
@@ -154,7 +153,7 @@ class LiveRack:
             ConfigError: The fault cannot begin in a running rack, or has no end but needs one.
             Failure: This process is not permitted to occupy a core.
         """
-        tick = self._segment.words[System.TICK]
+        tick = self._segment.tick
         where = KINDS[fault.kind].where
         if where == "start":
             why = (
@@ -228,7 +227,7 @@ class LiveRack:
         if entry.when_box < 0:
             if entry.tick <= 0:
                 return NEXT_TICK
-            tick = self._segment.words[System.TICK]
+            tick = self._segment.tick
             return f"tick {entry.tick}; the rack is at tick {tick}"
         when = (entry.when_box, entry.when_field, entry.when_value)
         return format_condition(when, self._segment.layout)
@@ -236,11 +235,14 @@ class LiveRack:
     def _to_document(self, entry: FaultEntry) -> Document:
         """Return a fault as plain data. `waits_for` is empty once it has begun."""
         waits_for = self._describe_awaited(entry) if entry.stage == Stage.WAITING else ""
-        return {**to_document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
+        return {
+            **to_document(entry, self._segment.layout, self._config.joints),
+            "waits_for": waits_for,
+        }
 
     def _describe_fault(self, entry: FaultEntry) -> str:
         """Describe a fault in one line."""
-        return describe_fault(entry, self._segment.layout, self._joints)
+        return describe_fault(entry, self._segment.layout, self._config.joints)
 
 
 def _format_cell(value: str | int | None) -> str:

@@ -314,7 +314,7 @@ def parse_tick(recording: Recording, text: str, asked: str = "") -> int:
     tick = -1
     # Text that is not a number is treated as a time outside the run.
     with suppress(ValueError, OverflowError):
-        tick = round(float(text) * 1e9 / recording.layout.clock_ns)
+        tick = recording.layout.to_ticks(float(text))
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
     begins, ends = find_tick_range(recording)
     if not (begins <= tick < ends and is_kept):

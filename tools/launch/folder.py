@@ -60,7 +60,7 @@ class EventLog:
     def add_event(self, event: Event) -> None:
         """Show and write an event."""
         self._display.show_event(event)
-        self._write_entry(asdict(event))
+        self._write_text(format_checked_line(asdict(event)))
 
     def open_file(self, path: Path) -> None:
         """Start writing to a file, beginning with all earlier events."""
@@ -73,7 +73,8 @@ class EventLog:
 
         Before, they are in the order of their reports, which may differ from that of their ticks.
         """
-        self._write_entry({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
+        entry = {"time_ns": time.time_ns(), "kind": "outcome", **outcome}
+        self._write_text(format_checked_line(entry))
         self.close()
         if self._file is not self._earlier and not self.has_failed:
             self._sort_lines(Path(self._file.name))
@@ -95,10 +96,6 @@ class EventLog:
             sorted_file.write_text("".join(ordered))
             sorted_file.replace(path)
         sorted_file.unlink(missing_ok=True)
-
-    def _write_entry(self, entry: Document) -> None:
-        """Write an entry as one line of JSON with a checksum."""
-        self._write_text(format_checked_line(entry))
 
     def _write_text(self, text: str) -> None:
         """Write a text. The first failed write is shown as an event; later texts are dropped."""

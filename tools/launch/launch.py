@@ -157,7 +157,7 @@ def run_rack(
     log = EventLog(display)
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to save, so a signal may end it at once.
-        with INTERRUPT.end_at_once():
+        with INTERRUPT.stop_orderly(INTERRUPT.end_process):
             lan = config.adapter.lan
             # A repeated run replays the recorded messages of other racks instead.
             launches = lan.launch if lan is not None and beginning.entries is None else ()
@@ -197,7 +197,7 @@ def run_rack(
             """Log new messages of the recorder, the viewer and the bridges."""
             for kind, read_notices in news:
                 for text in read_notices():
-                    log.add_event(Event(time.time_ns(), segment.words[System.TICK], kind, "", text))
+                    log.add_event(Event(time.time_ns(), segment.tick, kind, "", text))
 
         unfinished = UNFINISHED_HINT.format(folder) if folder else ""
         with INTERRUPT.stop_orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
@@ -217,7 +217,7 @@ def run_rack(
         failed = others.await_end()
         result = replace(
             build_result(segment, config, outcome, wall_s, recording, rows_lost),
-            others=others.list_ends(),
+            others=tuple(others.list_ends()),
             failed=failed,
             earlier=beginning.earlier,
         )

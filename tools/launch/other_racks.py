@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -104,15 +104,13 @@ class OtherRacks:
                 late.append(f"{rack.config}: still running")
         return "; ".join(late) or self.describe_failures()
 
-    def list_ends(self) -> tuple[OtherRackEnd, ...]:
-        """Return how each rack that ran has ended."""
-        ended = []
+    def list_ends(self) -> Iterator[OtherRackEnd]:
+        """Yield how each rack that ran has ended."""
         for rack in self._racks:
             report = _read_report(rack)
             if outcome := report.get("outcome"):
                 end = outcome["cause"], outcome["ticks"], outcome["digest"]
-                ended.append(OtherRackEnd(report["rack"], *end, report["folder"]))
-        return tuple(ended)
+                yield OtherRackEnd(report["rack"], *end, report["folder"])
 
     def __enter__(self) -> Self:
         return self

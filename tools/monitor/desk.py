@@ -46,8 +46,8 @@ class LevelCommander:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._config = read_stored(self._segment.config)
-        levels = PublishedRack.read_from_segment(self._segment).levels
+        self._config = read_stored(segment.config)
+        levels = PublishedRack.read_from_segment(segment).levels
         self._levels = {name: published for name, published in levels.items() if published.commands}
 
     def list_levels(self) -> list[dict[str, str]]:
@@ -149,7 +149,7 @@ class LevelCommander:
 
     def _build_request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
         """Build a command and its request to the clock. Raises the errors of `give_command`."""
-        tick = self._segment.words[System.TICK]
+        tick = self._segment.tick
         command = parse_command({key: value for key, value in fields.items() if value is not None})
         wanted = build_request(command, self._config, self._levels, self._segment.layout)
         if 0 <= wanted.tick <= tick:
@@ -214,7 +214,7 @@ class LevelCommander:
         about = f"command {reply.serial}"
         awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
         for is_over in self._poll_run(about, awaited):
-            late = last.explain_missing_reply(self._segment.words[System.TICK])
+            late = last.explain_missing_reply(self._segment.tick)
             reply = replies.read_statuses()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
                 break

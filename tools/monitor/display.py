@@ -198,17 +198,22 @@ class RackView:
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         if not has_space:
             yield from (Text(f"{name}: {why}", HOLD_STYLE) for name, why in reasons.items() if why)
-        sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
-        for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
+        tables: tuple[Sequence[Any], ...] = (
+            snapshot.hosts,
+            snapshot.entries,
+            snapshot.peers,
+            snapshot.imports,
+            snapshot.exports,
+        )
+        for rows in tables:
             if records := [asdict(row) for row in rows]:
                 texts = [[_format_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
                 yield build_grid(
                     [key.replace("_", " ") for key in records[0]], texts, width, style=_choose_style
                 )
-        yield from (Text(queue.line) for queue in snapshot.queues)
-        yield from (Text(inbox.line) for inbox in snapshot.inboxes)
-        yield from (Text(standby.line) for standby in snapshot.standbys)
+        described: list[Any] = [*snapshot.queues, *snapshot.inboxes, *snapshot.standbys]
+        yield from (Text(each.line) for each in described)
         yield from (Text(_format_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:

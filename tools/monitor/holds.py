@@ -11,7 +11,7 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.message import AnyMessage, Message, State, get_reason
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block
 from rack.boards.events import Event
 from rack.boards.lan.awaited import find_waits
 from rack.boards.operator import describe_command
@@ -164,7 +164,7 @@ class StandstillDetector:
         # Import late: this imports the kinds of faults, which would slow down `rack status`.
         from rack.tools.faults.ending import read_arm
 
-        tick = self._segment.words[System.TICK]
+        tick = self._segment.tick
         holds = [hold for hold in find_holds(self._newest) if hold.release]
         if not holds or not read_arm(self._segment).is_at_rest:
             self._still_since = None

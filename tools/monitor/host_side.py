@@ -55,9 +55,8 @@ class EntryRow:
     age_ms: float | None
 
 
-def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
-    """Return the current state of every host board."""
-    rows = []
+def list_host_rows(segment: Segment) -> Iterator[HostRow]:
+    """Yield the current state of every host board."""
     for host in segment.layout.hosts:
         block = segment.get_block(host.name)
         # The process of a host board locks this word. When it ends, the kernel unlocks the word.
@@ -67,8 +66,7 @@ def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
             state = DONE
         sent = sum(head[Box.HEAD] for head in _list_heads(segment, host.name))
         pid = block[Block.PID] if is_running else 0
-        rows.append(HostRow(host.name, pid, state, sent, count_restarts(segment, host.name)))
-    return tuple(rows)
+        yield HostRow(host.name, pid, state, sent, count_restarts(segment, host.name))
 
 
 def count_restarts(segment: Segment, writer: str) -> int:
@@ -78,8 +76,7 @@ def count_restarts(segment: Segment, writer: str) -> int:
     to standbys, which increment it too, are not counted.
     """
     hand_overs = segment.get_block(writer)[Block.HAND_OVERS]
-    heads = _list_heads(segment, writer)
-    return max([0, *(head[Box.EPOCH] - 1 - hand_overs for head in heads)])
+    return max([0, *(head[Box.EPOCH] - 1 - hand_overs for head in _list_heads(segment, writer))])
 
 
 def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
@@ -87,9 +84,8 @@ def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
     return [segment.get_box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
-def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
-    """Return the state of each entry of the bus adapters that have reported a status."""
-    rows: list[EntryRow] = []
+def list_entry_rows(newest: NewestMessages) -> Iterator[EntryRow]:
+    """Yield the state of each entry of the bus adapters that have reported a status."""
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
     for mailbox, entry, source in list_entries(segment.layout, segment.config):
@@ -99,8 +95,7 @@ def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
             age_ms = None if age < 0 else age * tick_ms
             numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
             board = mailbox.partition(".")[0]
-            rows.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
-    return tuple(rows)
+            yield EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms)
 
 
 def list_entries(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,23 +53,20 @@ class InboxFill:
 def find_inbox_depths(layout: Layout) -> dict[int, int]:
     """Return a dictionary from slot to inbox depth, for each board that messages interrupt."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
-    boxes = {slot: layout.list_interrupting_mailboxes(slot) for slot in slots}
     return {
-        slot: get_interrupt_spec(interrupting[0]).depth
-        for slot, interrupting in boxes.items()
-        if interrupting
+        slot: get_interrupt_spec(boxes[0]).depth
+        for slot in slots
+        if (boxes := layout.list_interrupting_mailboxes(slot))
     }
 
 
-def list_inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
-    """Return the state of the inbox of every board that messages interrupt."""
-    fills = []
+def list_inbox_fills(segment: Segment) -> Iterator[InboxFill]:
+    """Yield the state of the inbox of every board that messages interrupt."""
     for slot, depth in find_inbox_depths(segment.layout).items():
         board = segment.layout.find_interrupt_task(slot)
         block = segment.get_block(board)
         served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
-        fills.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
-    return tuple(fills)
+        yield InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth)
 
 
 class Arrivals(NamedTuple):
@@ -105,14 +103,13 @@ def replay_inbox(recording: Recording, slot: int) -> Arrivals:
     return Arrivals(numbers, times, ends, inbox.most_waiting)
 
 
-def summarize_interrupts(recording: Recording) -> list[Document]:
+def summarize_interrupts(recording: Recording) -> Iterator[Document]:
     """Describe the interrupts of every board in a run, as plain data.
 
     Latencies, in us, are measured from the sending of a message to the end of its service, when a
     level can read it.
     """
     layout = recording.layout
-    documents = []
     for slot, depth in find_inbox_depths(layout).items():
         arrivals = replay_inbox(recording, slot)
         is_served = arrivals.end_ns != NEVER_SERVED
@@ -122,18 +119,15 @@ def summarize_interrupts(recording: Recording) -> list[Document]:
             for mask in (is_served, ~is_served)
         )
         latency_ns = (arrivals.end_ns - arrivals.sent_ns)[is_served]
-        documents.append(
-            {
-                "board": layout.find_interrupt_task(slot),
-                "depth": depth,
-                "served": sum(served),
-                "lost": sum(lost),
-                "waiting": arrivals.most_waiting,
-                "latency_us": compute_distribution(latency_ns * 1e-3),
-                "mailboxes": [
-                    {"mailbox": box.name, "served": served[at], "lost": lost[at]}
-                    for at, box in enumerate(boxes)
-                ],
-            }
-        )
-    return documents
+        yield {
+            "board": layout.find_interrupt_task(slot),
+            "depth": depth,
+            "served": sum(served),
+            "lost": sum(lost),
+            "waiting": arrivals.most_waiting,
+            "latency_us": compute_distribution(latency_ns * 1e-3),
+            "mailboxes": [
+                {"mailbox": box.name, "served": served[at], "lost": lost[at]}
+                for at, box in enumerate(boxes)
+            ],
+        }

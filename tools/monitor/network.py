@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from rack.backplane.bounded_toml import load_toml
-from rack.backplane.segment import Segment
 from rack.levels.peer import Presence, format_peer_port
 from rack.tools.monitor.newest_messages import NewestMessages
 
@@ -86,14 +85,12 @@ class ExchangedEntries(NamedTuple):
 
 
 @cache
-def read_entries(config: str) -> ExchangedEntries | None:
+def read_entries(config: str) -> ExchangedEntries:
     """Read the exports, imports and partner racks from a config, given as TOML text.
 
-    Returns None for a rack without a network adapter.
+    All are empty for a rack without a network adapter.
     """
-    table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(ADAPTER)
-    if table is None:
-        return None
+    table: dict[str, Any] = load_toml(config).get("adapter", {}).get(ADAPTER, {})
     exports, imports = (
         {port: entry["from"] for port, entry in table.get(key, {}).items()}
         for key in ("export", "import")
@@ -102,47 +99,33 @@ def read_entries(config: str) -> ExchangedEntries | None:
     return ExchangedEntries(exports, imports, tuple(dict.fromkeys(racks)))
 
 
-def _find_entries(segment: Segment) -> ExchangedEntries:
-    """Return the exports, imports and partners of a rack. Empty without a network adapter."""
-    has_adapter = any(task.name == ADAPTER for task in segment.layout.tasks)
-    return (read_entries(segment.config) if has_adapter else None) or ExchangedEntries({}, {}, ())
-
-
-def list_peers(newest: NewestMessages) -> tuple[PeerRow, ...]:
-    """Return the state of each partner rack that the network adapter has reported."""
-    rows = []
-    for rack in _find_entries(newest.segment).peers:
+def list_peers(newest: NewestMessages) -> Iterator[PeerRow]:
+    """Yield the state of each partner rack that the network adapter has reported."""
+    for rack in read_entries(newest.segment.config).peers:
         peer: Any = newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")
         if peer is not None:
             is_known = peer.uncertainty > 0.0
             clock = (peer.offset * 1e3, peer.uncertainty * 1e3) if is_known else (None, None)
             state = Presence(peer.presence).name.lower()
-            rows.append(PeerRow(rack, state, peer.since, peer.launches, peer.losses, *clock))
-    return tuple(rows)
+            yield PeerRow(rack, state, peer.since, peer.launches, peer.losses, *clock)
 
 
-def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
-    """Return the state of each import of a rack."""
-    rows = []
-    for port, source, counts in _list_counts(
-        newest, "import", _find_entries(newest.segment).imports
-    ):
+def list_imports(newest: NewestMessages) -> Iterator[ImportRow]:
+    """Yield the state of each import of a rack."""
+    imports = read_entries(newest.segment.config).imports
+    for port, source, counts in _list_counts(newest, "import", imports):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
         numbers = {name: int(counts[name]) for name in COUNTS}
         entry = f"{ADAPTER}.{port}"
-        rows.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
-    return tuple(rows)
+        yield ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1])
 
 
-def list_exports(newest: NewestMessages) -> tuple[ExportRow, ...]:
-    """Return the state of each export of a rack."""
-    return tuple(
-        ExportRow(f"{ADAPTER}.{port}", source, int(counts["sent"]))
-        for port, source, counts in _list_counts(
-            newest, "export", _find_entries(newest.segment).exports
-        )
-    )
+def list_exports(newest: NewestMessages) -> Iterator[ExportRow]:
+    """Yield the state of each export of a rack."""
+    exports = read_entries(newest.segment.config).exports
+    for port, source, counts in _list_counts(newest, "export", exports):
+        yield ExportRow(f"{ADAPTER}.{port}", source, int(counts["sent"]))
 
 
 def _list_counts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -38,40 +39,34 @@ class QueueFill:
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
-def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
-    """Return the current state of every queue of a rack."""
-    fills = []
+def list_queue_fills(newest: NewestMessages) -> Iterator[QueueFill]:
+    """Yield the current state of every queue of a rack."""
     for box in list_queues(newest.segment.layout):
         # Read the reader's position first: messages taken after this still count as unread.
         position = newest.read_message(get_position_mailbox(box.name))
         words = newest.segment.get_box(box.name)
         unread = words[Box.SENT] - (0 if position is None else position.taken)
-        fills.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
-    return tuple(fills)
+        yield QueueFill(box.name, unread, box.capacity, words[Box.REFUSED])
 
 
-def summarize_queues(recording: Recording) -> list[Document]:
+def summarize_queues(recording: Recording) -> Iterator[Document]:
     """Describe the traffic of every queue in a run, as plain data.
 
     `waiting` is the largest number of messages in the queue at the beginning of a read. `refused`
     is None if it was not recorded.
     """
     refused = recording.end_counts.get("refused", {})
-    documents = []
     for box in list_queues(recording.layout):
         taken, unread = (
             recording.read_signal(get_position_mailbox(box.name), field)
             for field in ("taken", "unread")
         )
         before = np.concatenate(([0], taken[:-1]))
-        documents.append(
-            {
-                "mailbox": box.name,
-                "capacity": box.capacity,
-                "sent": int(recording.read_signal(box.name, "serial").max(initial=0)),
-                "taken": int(taken.max(initial=0)),
-                "waiting": int((taken + unread - before).max(initial=0)),
-                "refused": refused.get(box.name),
-            }
-        )
-    return documents
+        yield {
+            "mailbox": box.name,
+            "capacity": box.capacity,
+            "sent": int(recording.read_signal(box.name, "serial").max(initial=0)),
+            "taken": int(taken.max(initial=0)),
+            "waiting": int((taken + unread - before).max(initial=0)),
+            "refused": refused.get(box.name),
+        }

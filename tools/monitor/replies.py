@@ -82,9 +82,13 @@ class Reply:
 
 def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
     """Find the status mailbox of a level. None if it has no fields for replies to operators."""
-    boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
     return next(
-        (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),
+        (
+            box
+            for box in segment.layout.mailboxes
+            if box.name == f"{level}.status"
+            and {"order", "answer", "objection"} <= {field.name for field in box.fields}
+        ),
         None,
     )
 
@@ -155,7 +159,7 @@ class ReplyDeadline:
         self._bound = self._block[Block.CYCLES] + REPLY_CYCLES
         self._cycles = -1
         self._since = 0
-        shortest = round(NO_CYCLE_S * 1e9 / segment.layout.clock_ns)
+        shortest = segment.layout.to_ticks(NO_CYCLE_S)
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
     def explain_missing_reply(self, tick: int) -> str:

@@ -157,8 +157,7 @@ class RackMonitor:
         self._newest = NewestMessages(segment)
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
-        robot = load_toml(segment.config).get("robot", {})
-        self._joints = tuple(robot.get("joints", ()))
+        self._joints = tuple(load_toml(segment.config).get("robot", {}).get("joints", ()))
         self._traces = {
             task.name: open_trace_ring(segment, task.name) for task in segment.layout.tasks
         }
@@ -190,13 +189,13 @@ class RackMonitor:
             ),
             progress=self._find_progress(),
             holds=find_holds(self._newest),
-            hosts=list_host_rows(segment),
-            entries=list_entry_rows(self._newest),
-            queues=list_queue_fills(self._newest),
-            inboxes=list_inbox_fills(segment),
-            peers=list_peers(self._newest),
-            imports=list_imports(self._newest),
-            exports=list_exports(self._newest),
+            hosts=tuple(list_host_rows(segment)),
+            entries=tuple(list_entry_rows(self._newest)),
+            queues=tuple(list_queue_fills(self._newest)),
+            inboxes=tuple(list_inbox_fills(segment)),
+            peers=tuple(list_peers(self._newest)),
+            imports=tuple(list_imports(self._newest)),
+            exports=tuple(list_exports(self._newest)),
             standbys=list_standbys(segment),
             exchanges={
                 board: list_port_ages(message)
@@ -218,27 +217,26 @@ class RackMonitor:
                 PublishedRack.read_from_segment(self._segment)
             yield describe_fault(fault, self._segment.layout, self._joints)
 
-    def _list_warnings(self) -> list[str]:
-        """Return the names of asserted utility lines, and warnings about the rack."""
+    def _list_warnings(self) -> Iterator[str]:
+        """Yield the names of asserted utility lines, and warnings about the rack."""
         lines = self._lines
-        warnings = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        yield from (f"SYSFAIL slot {slot}" for slot in lines.sysfail)
         single = {
             "ACFAIL": lines.acfail,
             "SYSRESET": lines.sysreset,
             "EMERGENCY STOP": lines.emergency_stop,
         }
-        warnings += [name for name, asserted in single.items() if asserted]
+        yield from (name for name, asserted in single.items() if asserted)
         words = self._segment.words
         tasks = [task.name for task in self._segment.layout.tasks if task.priority]
         blocks = zip(tasks, map(self._segment.get_block, tasks), strict=True)
         refused = [name for name, block in blocks if block[Block.PID] and not block[Block.PRIORITY]]
         if refused and words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]:
-            warnings.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
+            yield f"NO REAL-TIME PRIORITY: {', '.join(refused)}"
         if words[System.HELD]:
-            warnings.append(HELD_WARNING.format(self._segment.rack))
+            yield HELD_WARNING.format(self._segment.rack)
         if count := words[System.SNAPSHOTS]:
-            warnings.append(f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB")
-        return warnings
+            yield f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB"
 
     def _describe_task(self, task: TaskSpec) -> TaskRow:
         """Return the current state of a task."""
@@ -266,7 +264,7 @@ class RackMonitor:
             cycles=block[Block.CYCLES],
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
-            skipped=self._segment.count_cycles(task, self._segment.words[System.TICK] - 1).skipped,
+            skipped=self._segment.count_cycles(task, self._segment.tick - 1).skipped,
             restarts=count_restarts(self._segment, task.name),
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,

@@ -121,7 +121,7 @@ class Divergence:
         }
         self._begin, _ = find_common_ticks(first_run, second_run)
 
-    def trace_cause(self, mailbox: str = "") -> tuple[DivergentCycle, ...]:
+    def trace_cause(self, mailbox: str) -> tuple[DivergentCycle, ...]:
         """Trace a difference back to its cause.
 
         Args:
@@ -157,11 +157,9 @@ class Divergence:
         clues = [*self._find_event_clues(box, message)]
         if box.writer != CLOCK:
             clues += self._find_miss_clues(layout.find_task(box.writer), message.tick)
-        if not first and box.writer != CLOCK:
-            clues += [
-                *self._find_config_clues(box.writer),
-                *self._find_unrecorded_inputs(box.writer),
-            ]
+            if not first:
+                clues += self._find_config_clues(box.writer)
+                clues += self._find_unrecorded_inputs(box.writer)
         return DivergentCycle(
             tick=message.tick,
             mailbox=box.name,

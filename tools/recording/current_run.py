@@ -20,9 +20,8 @@ def find_run_folder(segment: Segment) -> Path | None:
     """
     if not segment.launcher:
         return None
-    pid = segment.words[System.FOLLOWER_PID]
     with suppress(OSError):
-        for file in Path(f"/proc/{pid}/fd").iterdir():
+        for file in Path(f"/proc/{segment.words[System.FOLLOWER_PID]}/fd").iterdir():
             # A descriptor may be closed while this loop runs.
             with suppress(OSError):
                 if (path := file.readlink()).name == SPOOL:

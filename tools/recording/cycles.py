@@ -11,7 +11,6 @@ from rack.backplane.layout import TaskSpec
 from rack.boards.timing.tasks import Budget
 from rack.boards.timing.trace_times import (
     Occupation,
-    compute_overhead_ns,
     compute_unit_times,
     select_plans,
 )
@@ -48,8 +47,6 @@ class Cycles:
             starting or the core may have been unavailable.
         stalled_count: Number of cycles in which the core may have been unavailable, see
             `analyze_stalls`.
-        overhead_ns: Time per cycle outside these functions, for waking up and closing the cycle.
-        stretches: Index of the recorded stretch that contains each cycle, see `find_stretches`.
     """
 
     task: TaskSpec
@@ -62,8 +59,6 @@ class Cycles:
     write_ns: np.ndarray
     is_judged: np.ndarray
     stalled_count: int
-    overhead_ns: int
-    stretches: np.ndarray
 
     @property
     def communication_ns(self) -> np.ndarray:
@@ -79,7 +74,7 @@ class Cycles:
 def read_cycles(recording: Recording) -> dict[str, Cycles]:
     """Return a dictionary from task to its cycles. Tasks without recorded cycles are left out."""
     _, absent = analyze_stalls(recording)
-    tasks = [task for task in recording.layout.tasks if len(recording.read_trace(task.name))]
+    tasks = [task for task in recording.layout.tasks if task.name in recording.cycles]
     places = {task.name: recording.find_core_and_priority(task) for task in tasks}
     spans = {task.name: Occupation.from_records(recording.cycles[task.name]) for task in tasks}
     with_planner = {task.board for task in recording.layout.tasks if task.role == "planner"}
@@ -116,8 +111,6 @@ def read_cycles(recording: Recording) -> dict[str, Cycles]:
                 write_ns=write_ns,
                 is_judged=judged,
                 stalled_count=int(settled.sum() - judged.sum()),
-                overhead_ns=compute_overhead_ns(rows),
-                stretches=recording.find_stretches(rows["tick"]),
             )
     return by_task
 
@@ -127,7 +120,7 @@ def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> 
 
     If every cycle lies within a start-up, the mask is True for all of them.
     """
-    span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
+    span = recording.layout.to_ticks(START_UP_S)
     settled = np.ones(len(ticks), bool)
     for start_tick in (0, *list_restarts(recording).get(task, ())):
         settled &= (ticks < start_tick) | (ticks >= start_tick + span)
@@ -202,7 +195,7 @@ def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float)
     )
 
 
-def compute_percentile(times_ns: np.ndarray, percentile: float = WORST_PERCENTILE) -> int:
+def compute_percentile(times_ns: np.ndarray, percentile: float) -> int:
     """Return a percentile of measured times, rounded up to the next measured time.
 
     Args:

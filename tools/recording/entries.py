@@ -136,14 +136,10 @@ def _load_issued_commands(recording: Recording) -> list[Request]:
         ids = messages[COMMAND_ID].tolist()
         # Clear the id, because a new one is assigned when the command is issued again.
         messages[COMMAND_ID] = 0
-        for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
-            numbered.append(
-                (
-                    tick,
-                    number,
-                    Request(layout.find_mailbox_index(box.name), message.tobytes(), tick),
-                )
-            )
+        numbered += [
+            (tick, number, Request(layout.find_mailbox_index(box.name), message.tobytes(), tick))
+            for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True)
+        ]
     numbered.sort(key=lambda command: command[:2])
     return [request for _, _, request in numbered]
 

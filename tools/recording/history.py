@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.backplane.message import State
+from rack.backplane.message import State, escape_text
 from rack.boards.timing.trace_times import (
     compute_duration_ns,
     compute_lateness_ns,
@@ -38,22 +38,15 @@ def list_misses(recording: Recording) -> list[Document]:
         Entries with task, tick, `what` ("late" or "skipped") and count. Entries of late cycles
         also have the lateness and the duration in ms.
     """
-    entries = []
-    for task in recording.layout.tasks:
-        entries += _list_task_misses(task, recording.read_trace(task.name))
-        done = recording.find_task_counts(task.name).get("done")
-        if done is None:
-            # The end of the run was not recorded, or an earlier version recorded the run.
-            continue
-        if count := task.count_unfinished(done, recording.end_counts["outcome"]["ticks"]):
-            entries.append(_build_skip_entry(task, task.grid.find_tick(done + 1), count))
+    tasks = recording.layout.tasks
+    entries = [entry for task in tasks for entry in _list_task_misses(recording, task)]
     return sorted(entries, key=lambda miss: (miss["tick"], miss["task"]))
 
 
-def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
-    """Return the late cycles and skipped releases in the trace of one task."""
+def _list_task_misses(recording: Recording, task: TaskSpec) -> Iterator[Document]:
+    """Yield the late cycles and skipped releases of one task."""
+    cycles = recording.read_trace(task.name)
     rows = cycles[find_missed_cycles(cycles) | (count_skipped_releases(cycles) > 0)]
-    entries = []
     columns = (
         rows["tick"],
         count_skipped_releases(rows),
@@ -65,13 +58,16 @@ def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
         *(column.tolist() for column in columns), strict=True
     ):
         if skipped_before:
-            entries.append(
-                _build_skip_entry(task, tick - skipped_before * task.every, skipped_before)
-            )
+            yield _build_skip_entry(task, tick - skipped_before * task.every, skipped_before)
         if missed:
             times = {"started_ms": round(late_ms, 6), "took_ms": round(lasted_ms, 6)}
-            entries.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
-    return entries
+            yield {"task": task.name, "tick": tick, "what": "late", "count": 1, **times}
+    done = recording.find_task_counts(task.name).get("done")
+    if done is None:
+        # The end of the run was not recorded, or an earlier version recorded the run.
+        return
+    if count := task.count_unfinished(done, recording.end_counts["outcome"]["ticks"]):
+        yield _build_skip_entry(task, task.grid.find_tick(done + 1), count)
 
 
 def _build_skip_entry(task: TaskSpec, tick: int, count: int) -> Document:
@@ -180,11 +176,11 @@ def _list_level_holds(recording: Recording, mailbox: str) -> Iterator[Document]:
         if first == end or not hold_codes[first]:
             continue
         is_operators = hold_codes[first] > 0
-        why = (
-            Operation(hold_codes[first]).name.lower()
-            if is_operators
-            else recording.read_reason(mailbox, end - 1)
-        )
+        why = ""
+        if is_operators:
+            why = Operation(hold_codes[first]).name.lower()
+        elif "reason" in fields:
+            why = escape_text(str(recording.read_signal(mailbox, "reason")[end - 1]))
         since, until = ticks[[first, min(end, len(ticks) - 1)]].tolist()
         yield {
             "level": mailbox.removesuffix(".status"),

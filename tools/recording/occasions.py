@@ -59,8 +59,7 @@ class Retention(NamedTuple):
         config = RecordConfig.model_validate(load_toml(segment.config).get("record", {}))
         if config.keep is None:
             return None
-        spans_s = (config.keep, config.before, config.after)
-        return cls(*(round(span_s * 1e9 / segment.layout.clock_ns) for span_s in spans_s))
+        return cls(*map(segment.layout.to_ticks, (config.keep, config.before, config.after)))
 
     def find_window(self, tick: int) -> TickRange:
         """Return the ticks that are kept around an occasion at `tick`."""
@@ -78,10 +77,9 @@ class Retention(NamedTuple):
             kept: Ticks that were kept, as ranges [first, end).
             ticks: Length of the run in ticks.
         """
-        occasions = Occasions(segment).find_alarm_ticks()
         windows = [
             TickRange(max(0, ticks - self.keep), ticks - 1),
-            *map(self.find_window, occasions),
+            *map(self.find_window, Occasions(segment).find_alarm_ticks()),
         ]
         clipped = [TickRange(first, min(last, ticks - 1)) for first, last in windows]
         return [
@@ -149,7 +147,7 @@ class FlightRecorder:
         self._tally = tally
         self._words = segment.words
         self._occasions = Occasions(segment)
-        self._length = round(STRETCH_S * 1e9 / segment.layout.clock_ns)
+        self._length = segment.layout.to_ticks(STRETCH_S)
         # Finished stretches that are not near any occasion found so far, with their last ticks.
         self._sealed: deque[tuple[Path, int]] = deque()
         self._kept_until = -1

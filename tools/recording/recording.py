@@ -18,7 +18,6 @@ from pydantic import TypeAdapter
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.history import build_row_dtype
-from rack.backplane.message import escape_text
 from rack.backplane.segment import Launch, Segment, restore_layout
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, read_stored
@@ -217,7 +216,7 @@ class Recording:
         """
         # Rows may lie slightly outside their stretch. Each border between two stretches is
         # therefore halfway between them, but at most one second after the earlier one.
-        second = round(1e9 / self.layout.clock_ns)
+        second = self.layout.to_ticks(1.0)
         borders = [
             end + min((first - end) // 2, second) for (_, end), (first, _) in pairwise(self.kept)
         ]
@@ -358,11 +357,6 @@ class Recording:
         column = pa.concat_tables(tables).column(0).combine_chunks()
         values = column.flatten() if shape else column
         return np.asarray(values.to_numpy(zero_copy_only=False).reshape(-1, *shape))
-
-    def read_reason(self, mailbox: str, row: int) -> str:
-        """Return the reason in one row of a mailbox as printable text, or "" if there is none."""
-        has_reason = "reason" in self.list_fields(mailbox)
-        return escape_text(str(self.read_signal(mailbox, "reason")[row])) if has_reason else ""
 
     def read_rows(self, name: str) -> np.ndarray:
         """Return the recorded rows of a task (trace records) or of a mailbox, oldest first."""

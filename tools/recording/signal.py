@@ -84,11 +84,6 @@ class Signal(Column):
         """Name and unit, as the heading of a column."""
         return f"{self.name}, {self.unit}".removesuffix(", ")
 
-    @property
-    def is_number(self) -> bool:
-        """True if the signal is a single number."""
-        return len(self.index) == len(self.shape) and not self.is_text
-
     def extract_values(self, messages: np.ndarray) -> np.ndarray:
         """Return the signal's value in each message.
 
@@ -195,8 +190,8 @@ class Trigger:
             example = "servo.status.position[2] > 1.2"
             raise Failure(f'"{text}" is not a condition; write one like "{example}"', 2)
         signal = Signal.parse(match[1], boxes)
-        if not signal.is_number:
-            shape = list(signal.shape[len(signal.index) :])
+        shape = list(signal.shape[len(signal.index) :])
+        if shape or signal.is_text:
             what = f"numbers of shape {shape}" if shape else "text"
             raise Failure(f"{signal.name} is {what}; a condition needs a single number", 2)
         names = dict(signal.spec.values)

@@ -285,10 +285,9 @@ def _find_shift(grid: RackGrid, line: RackGrid) -> TimeShift | None:
 
 def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
     """Return the mailbox in which `observer` recorded the presence of `peer`, or None."""
-    boxes = observer.recording.layout.mailboxes
     names = (
         box.name
-        for box in boxes
+        for box in observer.recording.layout.mailboxes
         if box.message == PeerPresence.message_type.name
         and box.name.endswith(f".{format_peer_port(peer.rack)}")
     )

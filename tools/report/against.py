@@ -9,7 +9,7 @@ from dataclasses import asdict
 from rack.backplane.address_map import CLOCK
 from rack.tools.console.answer import Document, Failure
 from rack.tools.monitor.signals import format_value
-from rack.tools.recording.causes import Clue, Divergence, DivergentCycle, ValueDifference
+from rack.tools.recording.causes import Divergence, DivergentCycle, ValueDifference
 from rack.tools.recording.divergence import Difference
 from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
@@ -106,7 +106,11 @@ def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
     else:
         yield f"'{cycle.writer}' wrote it; it reads no mailbox"
     settings = [clue.values for clue in cycle.clues if clue.values is not None]
-    yield from (_format_clue(clue) for clue in cycle.clues if clue.values is None)
+    yield from (
+        f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
+        for clue in cycle.clues
+        if clue.values is None
+    )
     if settings:
         yield _join_clauses(_format_difference(values, other, "not set") for values in settings)
     if not (cycle.clues or cycle.unequal):
@@ -139,16 +143,12 @@ def _format_difference(difference: ValueDifference, other_folder: str, absent: s
         other_folder: Folder of the other run.
         absent: Text for a value that a run does not have.
     """
-    texts = [_format_value(value, absent) for value in (difference.here, difference.there)]
+    values = (difference.here, difference.there)
+    texts = [absent if value is None else format_value(value) or '""' for value in values]
     if texts[0] == texts[1]:
         # The numbers differ only in digits that the short format does not show.
-        texts = [repr(difference.here), repr(difference.there)]
+        texts = [*map(repr, values)]
     return f"{difference.name} is {texts[0]}, in {other_folder} {texts[1]}"
-
-
-def _format_value(value: object, absent: str) -> str:
-    """Format a value as text. None is shown as `absent`."""
-    return absent if value is None else format_value(value) or '""'
 
 
 def _join_clauses(texts: Iterator[str]) -> str:
@@ -156,11 +156,6 @@ def _join_clauses(texts: Iterator[str]) -> str:
     clauses = [*texts]
     more = [f"{len(clauses) - MAX_SHOWN} more"] if len(clauses) > MAX_SHOWN else []
     return "; ".join([*clauses[:MAX_SHOWN], *more])
-
-
-def _format_clue(clue: Clue) -> str:
-    """Return a sentence about a clue, with its run and tick unless it applies to whole runs."""
-    return f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
 
 
 def _format_repetition(repetition: Repetition, cycle: DivergentCycle, other: str) -> Iterator[str]:

@@ -30,8 +30,8 @@ Causes = dict[tuple[str, int], tuple[str, int]]
 
 def add_causes(
     recording: Recording, misses: Sequence[Document], absent: Mapping[int, Occupation]
-) -> list[Document]:
-    """Return the entries of `list_misses` with their causes.
+) -> Iterator[Document]:
+    """Yield the entries of `list_misses` with their causes.
 
     Args:
         recording: The run.
@@ -50,7 +50,6 @@ def add_causes(
         recording.end_counts.get("faults", ())
     )
     otherwise = SIMULATED_CORE if recording.rack_config.simulated_load else NOT_RECORDED
-    explained = []
     for miss in misses:
         task = layout.find_task(miss["task"])
         why, ns = causes.get((task.name, miss["tick"]), (otherwise, 0))
@@ -58,8 +57,7 @@ def add_causes(
             why, ns = fault, 0
         # The kernel counts steal in steps that are longer than most delays.
         ms = ns / 1e6 if ns and why != HYPERVISOR else None
-        explained.append({**miss, "why": why, "why_ms": ms})
-    return explained
+        yield {**miss, "why": why, "why_ms": ms}
 
 
 def _find_delays(recording: Recording, task: TaskSpec, absent: Mapping[int, Occupation]) -> Causes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -108,7 +108,7 @@ def build_report(recording: Recording) -> Document:
         _build_head(config, ended, tasks, last_tick + 1, response),
         folder=str(recording.folder),
         continues=None if origin is None else origin.to_document(layout.clock_ns),
-        misses=add_causes(recording, missed_cycles, absent),
+        misses=list(add_causes(recording, missed_cycles, absent)),
         steal=summarize_steal(recording),
         stalls=asdict(stalls),
         notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
@@ -117,16 +117,16 @@ def build_report(recording: Recording) -> Document:
         **report_faults(recording.events, layout),
         standbys=summarize_standbys(recording),
         system_response=response,
-        data_ages=summarize_data_ages(recording),
-        entries=_summarize_entries(recording),
+        data_ages=list(summarize_data_ages(recording)),
+        entries=list(_summarize_entries(recording)),
         network=summarize_network(recording),
         task=arm_outcome.summarize_task(recording),
         objects=list(arm_outcome.summarize_objects(recording, config)),
         motion=arm_outcome.summarize_motion(recording),
         hand=arm_outcome.summarize_hand(recording, config),
         force=arm_outcome.summarize_force(recording),
-        queues=summarize_queues(recording),
-        interrupts=summarize_interrupts(recording),
+        queues=list(summarize_queues(recording)),
+        interrupts=list(summarize_interrupts(recording)),
         recording=ended.get("recording", "without the end of the run"),
         **summarize_gaps(recording),
     ).to_document()
@@ -262,9 +262,8 @@ def _describe_task(task: TaskSpec, layout: Layout) -> Document:
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
-def _summarize_entries(recording: Recording) -> list[Document]:
-    """Return counts and message ages (in ms) for every entry that a bus adapter forwards."""
-    entries = []
+def _summarize_entries(recording: Recording) -> Iterator[Document]:
+    """Yield counts and message ages (in ms) for every entry that a bus adapter forwards."""
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in list_entries(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
@@ -272,17 +271,15 @@ def _summarize_entries(recording: Recording) -> list[Document]:
             counts = _read_last_counts(recording, mailbox, entry, ENTRY_COUNTS)
             name = f"{mailbox.partition('.')[0]}.{entry}"
             ages_ms = compute_distribution(ages[ages >= 0] * tick_ms)
-            entries.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
-    return entries
+            yield {"entry": name, "source": source, **counts, "age_ms": ages_ms}
 
 
-def summarize_data_ages(recording: Recording) -> list[Document]:
-    """Return the ages in ms of the messages at each input of the boards with an exchange record.
+def summarize_data_ages(recording: Recording) -> Iterator[Document]:
+    """Yield the ages in ms of the messages at each input of the boards with an exchange record.
 
     An age counts from the release of the writer's cycle to that of the cycle that takes the
     message. `jitter` is the difference of the largest and the smallest age.
     """
-    inputs = []
     for box in recording.layout.mailboxes:
         board, _, port = box.name.partition(".")
         if port != EXCHANGE_PORT:
@@ -293,15 +290,12 @@ def summarize_data_ages(recording: Recording) -> list[Document]:
             is_new = recording.read_signal(box.name, taken.name) == ticks
             ages = recording.read_signal(box.name, age.name)[is_new] * recording.layout.clock_ns
             if ages_ms := compute_distribution(ages * 1e-6):
-                inputs.append(
-                    {
-                        "entry": f"{board}.{age.name.removesuffix(f'_{AGE_SUFFIX}')}",
-                        "taken": len(ages),
-                        "jitter": ages_ms["max"] - ages_ms["min"],
-                        "age_ms": ages_ms,
-                    }
-                )
-    return inputs
+                yield {
+                    "entry": f"{board}.{age.name.removesuffix(f'_{AGE_SUFFIX}')}",
+                    "taken": len(ages),
+                    "jitter": ages_ms["max"] - ages_ms["min"],
+                    "age_ms": ages_ms,
+                }
 
 
 def summarize_network(recording: Recording) -> Document | None:
@@ -311,9 +305,9 @@ def summarize_network(recording: Recording) -> Document | None:
         Imports with counts and ages in ms, exports with counts, and the states of the other racks.
         None if the rack has no network adapter, or if none of its messages were recorded.
     """
-    exchange = read_entries(recording.config)
-    if exchange is None or STATUS not in recording.mailboxes:
+    if STATUS not in recording.mailboxes or recording.rack_config.adapter.lan is None:
         return None
+    exchange = read_entries(recording.config)
     imports = []
     for port, source in exchange.imports.items():
         ages_s = recording.read_signal(STATUS, f"import_{port}.age_s")

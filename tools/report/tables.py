@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rack.boards.timing.level import LevelTiming
-from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
+from rack.boards.timing.trace_times import (
+    compute_distribution,
+    compute_overhead_ns,
+    count_misses_and_skips,
+)
 from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
@@ -103,13 +107,14 @@ def build_task_document(cycles: Cycles, analysis: Analysis) -> Document:
         "missed": missed,
         "skipped": skipped,
         "used_ms": compute_distribution(cycles.used_ns[judged] * MS_PER_NS),
-        "beside_ms": round(cycles.overhead_ns * MS_PER_NS, 6),
+        # Time per cycle outside the unit functions, for waking up and closing the cycle.
+        "beside_ms": round(compute_overhead_ns(cycles.rows) * MS_PER_NS, 6),
         **compute_task_times(
             cycles.task,
             rows,
             rack.tick_ns,
             analysis.takes_time,
-            stretches=cycles.stretches[judged],
+            stretches=analysis.recording.find_stretches(rows["tick"]),
             due_ns=compute_due_ns(rack, cycles.task),
             parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
         ),

@@ -13,7 +13,7 @@ from rack.boards.timing.trace_times import (
     compute_execution_ns,
     compute_gaps_ns,
     compute_lateness_ns,
-    compute_residual_ns,
+    compute_response_ns,
 )
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable, format_decimal, format_figure
@@ -90,7 +90,8 @@ def compute_task_times(
     )
     by_the_clock: Document = {
         "lateness_ms": compute_distribution(compute_lateness_ns(cycles) * MS_PER_NS),
-        "residual_ms": compute_distribution(compute_residual_ns(cycles, due_ns) * MS_PER_NS),
+        # The time from the end of a cycle to its deadline, negative if the deadline was missed.
+        "residual_ms": compute_distribution((due_ns - compute_response_ns(cycles)) * MS_PER_NS),
         "largest_gap_ms": round(float(gaps.max()) * MS_PER_NS, 6) if len(gaps) else None,
         "alpha_ms": None,
         "deviation_ms": None,

@@ -136,8 +136,7 @@ def _describe_monitors(config: RackConfig) -> Iterator[Document]:
         if kind is None or not issubclass(kind, ArmParams):
             continue
         sensors = find_arm(read_params(kind, table.params).arm).sensors
-        cell = build_rack_cell(config)
-        limits = compute_tolerance(replace_encoders(cell, robot, sensors))
+        limits = compute_tolerance(replace_encoders(build_rack_cell(config), robot, sensors))
         yield {
             "board": board,
             "position_mrad": (1e3 * limits.position).round(3).tolist(),
@@ -151,18 +150,17 @@ def _describe_network(config: RackConfig) -> Document | None:
     table = config.adapter.lan
     if table is None:
         return None
-    entries: list[Document] = []
-    for direction, ports in (("out", table.exports), ("in", table.imports)):
-        for port, entry in ports.items():
-            entries.append(
-                {
-                    "entry": f"{LAN}.{port}",
-                    "way": direction,
-                    "mailbox": entry.source,
-                    "rate_hz": entry.rate_hz,
-                    "max_age_ms": getattr(entry, "max_age_ms", None),
-                }
-            )
+    entries = [
+        {
+            "entry": f"{LAN}.{port}",
+            "way": direction,
+            "mailbox": entry.source,
+            "rate_hz": entry.rate_hz,
+            "max_age_ms": getattr(entry, "max_age_ms", None),
+        }
+        for direction, ports in (("out", table.exports), ("in", table.imports))
+        for port, entry in ports.items()
+    ]
     keys = ("listen", "connect", "lease_ms", "on_peer_loss")
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 

@@ -49,8 +49,7 @@ def measure_joined_runs(recordings: Sequence[Recording]) -> list[Document]:
     linked = {station.rack for chain in joined.chains for station in chain}
     for rack, recording in runs.items():
         if rack not in linked:
-            entries = read_entries(recording.config)
-            peers = ", ".join(entries.peers if entries else ()) or "no rack"
+            peers = ", ".join(read_entries(recording.config).peers) or "no rack"
             raise Failure(
                 f"{recording.folder}: no command passes between '{rack}' and the other racks given;"
                 f" it exchanges messages with {peers}",
@@ -148,9 +147,7 @@ def _match_messages(
     Raises:
         Failure: There are none, or they differ.
     """
-    entries = read_entries(recording.config)
-    assert entries is not None, "it has imports"
-    sent = other.read_rows(entries.imports[port].partition("/")[2])
+    sent = other.read_rows(read_entries(recording.config).imports[port].partition("/")[2])
     got = recording.read_rows(f"{ADAPTER}.{port}")
     messages = messages.select_messages(np.isin(messages.serials, sent["serial"]))
     sent = sent[np.searchsorted(sent["serial"], messages.serials)]

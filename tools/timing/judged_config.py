@@ -114,7 +114,7 @@ class JudgedConfig:
         system = (verdict for verdict in response if verdict.key not in self.failing)
         return all(
             verdict.holds
-            for verdict in chain(evaluate_level(changed, changed.build_level(board)), system)
+            for verdict in chain(evaluate_level(changed, changed.levels[board]), system)
         )
 
 
@@ -139,7 +139,7 @@ class Change:
     @property
     def _level_timings(self) -> tuple[LevelTiming, LevelTiming]:
         """Timing of the board's level before and after the change."""
-        return self.before.timing.build_level(self.board), self.after.timing.build_level(self.board)
+        return self.before.timing.levels[self.board], self.after.timing.levels[self.board]
 
     @property
     def cost(self) -> tuple[bool, float, int, int]:

@@ -94,7 +94,6 @@ def measure_system_response(recording: Recording) -> Document | None:
     """
     rack = build_rack_timing(recording.rack_config, recording.layout)
     paths = read_joined_paths(recording)
-    imported = read_entries(recording.config)
     documents = [
         _measure_response(recording, rack, chains)
         for chains in sorted(rack.chain_groups, key=lambda chains: chains != rack.hierarchy)
@@ -105,7 +104,7 @@ def measure_system_response(recording: Recording) -> Document | None:
     # Without measurements, a response needs no place beside others.
     measured = [one for one in documents if one["command"]["levels"] or one["status"]["levels"]]
     first, *others = measured or documents[:1]
-    crosses_racks = not paths and imported is not None and bool(imported.imports)
+    crosses_racks = not paths and bool(read_entries(recording.config).imports)
     return {**first, "crosses_racks": crosses_racks, "others": others}
 
 
@@ -145,8 +144,7 @@ def _measure_direction(
         for boards in chains
         for row in {row[-1:]: row for row in find_path_mailboxes(layout, boards)}.values()
     ]
-    entries = read_entries(recording.config)
-    imported = {f"{ADAPTER}.{port}" for port in entries.imports} if entries else set[str]()
+    imported = {f"{ADAPTER}.{port}" for port in read_entries(recording.config).imports}
     if any(boxes and not imported.isdisjoint(boxes[0].rests_on) for _, boxes in paths):
         return NOT_MEASURED
     hop_count = min(len(mailboxes) for _, mailboxes in paths)
@@ -242,8 +240,9 @@ def find_origins(recording: Recording, path: JoinedPath, refine: Refinement | No
         gaps=np.zeros(len(rows), int),
     )
     # Without the other recordings, times of messages are whole ticks.
-    rounding_ms = tick_ms if refine is None else 0.0
+    rounding_ms = tick_ms
     if refine is not None:
+        rounding_ms = 0.0
         messages = refine(recording, path, messages)
     rack, board = path.stations[-1 - len(path.boards)]
     all_far_ms = (messages.written - messages.arrived) * tick_ms

@@ -129,30 +129,27 @@ class OperatorResponse:
         """Whether all responses are within bounds and, in lockstep, at the predicted ticks."""
         return not self.commands_beyond_bound and not (self.lockstep and self.mispredicted_commands)
 
-    def build_rows(self) -> list[Document]:
-        """Return the figures of every level that was commanded, in ms of simulated time."""
-        return [self._build_row(level, path) for level, path in self.paths.items()]
-
-    def _build_row(self, level: str, path: CommandPath) -> Document:
-        """Return the figures of one level, in ms of simulated time."""
-        commands = [c for c in self.measured_commands if c.level == level]
-        ms = np.array([c.ticks for c in commands]) * self.tick_ms
-        waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
-        none = dict.fromkeys(("min", "p50", "max"))
-        stats = compute_distribution(ms) or none
-        return {
-            "level": level,
-            "commands": len(commands),
-            "min_ms": stats["min"],
-            "median_ms": stats["p50"],
-            "max_ms": stats["max"],
-            "max_from_reading_ms": (compute_distribution(ms - waits_ms) or none)["max"],
-            "longest_ms": path.longest * self.tick_ms,
-            "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
-            "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
-            "beyond": sum(c.level == level for c in self.commands_beyond_bound),
-            "off_prediction": sum(c.level == level for c in self.mispredicted_commands),
-        }
+    def build_rows(self) -> Iterator[Document]:
+        """Yield the figures of every level that was commanded, in ms of simulated time."""
+        for level, path in self.paths.items():
+            commands = [c for c in self.measured_commands if c.level == level]
+            ms = np.array([c.ticks for c in commands]) * self.tick_ms
+            waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
+            none = dict.fromkeys(("min", "p50", "max"))
+            stats = compute_distribution(ms) or none
+            yield {
+                "level": level,
+                "commands": len(commands),
+                "min_ms": stats["min"],
+                "median_ms": stats["p50"],
+                "max_ms": stats["max"],
+                "max_from_reading_ms": (compute_distribution(ms - waits_ms) or none)["max"],
+                "longest_ms": path.longest * self.tick_ms,
+                "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
+                "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
+                "beyond": sum(c.level == level for c in self.commands_beyond_bound),
+                "off_prediction": sum(c.level == level for c in self.mispredicted_commands),
+            }
 
     def to_document(self) -> Document:
         """Convert the response to plain data."""
@@ -163,7 +160,7 @@ class OperatorResponse:
             "measured": len(self.measured_commands),
             "beyond": len(self.commands_beyond_bound),
             "off_prediction": len(self.mispredicted_commands),
-            "levels": self.build_rows(),
+            "levels": [*self.build_rows()],
             "each": [*map(asdict, self.commands)],
         }
 

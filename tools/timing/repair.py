@@ -13,7 +13,6 @@ from typing import Any
 
 from rack.boards.config.schema import LONGEST_EVERY
 from rack.boards.timing.level import LevelTiming
-from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
 
@@ -66,11 +65,6 @@ class Repair:
     steps: tuple[tuple[Change, ...], ...]
     end: JudgedConfig
 
-    @property
-    def remaining_failures(self) -> tuple[EquationVerdict, ...]:
-        """Failures that remain after the last step."""
-        return self.end.failures
-
     def list_fixes(self) -> Iterator[Fix]:
         """Yield sequences of changes after each of which the rack fits, shortest first."""
         firsts = tuple(changes[0] for changes in self.steps)
@@ -83,7 +77,7 @@ class Repair:
         """Convert the repair to plain data."""
         return {
             "steps": [[change.to_document() for change in changes] for changes in self.steps],
-            "fits": not self.remaining_failures,
+            "fits": not self.end.failures,
         }
 
 
@@ -129,7 +123,7 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     """
     cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
     places = list(_list_loose_couplings(rack, board))
-    older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
+    older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.levels[board])]
     kinds = (
         _try_each(rack, board, _list_priorities(rack, board)),
         _try_each(rack, board, cores),
@@ -169,7 +163,7 @@ def _list_longer_cycles(rack: JudgedConfig, board: str) -> list[Settings]:
     """
     timing = rack.timing
     every = timing.boards[board].every
-    level = timing.build_level(board)
+    level = timing.levels[board]
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest_every = min(MAX_FACTOR * every, LONGEST_EVERY)
     longer_settings: list[Settings] = []
@@ -193,7 +187,7 @@ def _list_loose_couplings(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     slot = rack.config.board[board].planner_slot
     if slot is None:
         slot = next(iter(rack.config.list_free_slots()), None)
-    if rack.timing.build_level(board).within_cycles is not None and slot is not None:
+    if rack.timing.levels[board].within_cycles is not None and slot is not None:
         for core in _list_other_cores(rack, rack.timing.boards[board].planner_core):
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": core}
 

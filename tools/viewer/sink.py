@@ -17,7 +17,6 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.boards.config import RackConfig, build_rack_timing, read_stored
 from rack.levels.messages import ArmState, MovePlan, MoveStatus, TaskPlan
 from rack.levels.robot.cell import Cell, build_cell
@@ -254,9 +253,9 @@ class ViewSink:
         self._writer = RackWriter(self._stream, ran)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = compute_block_ticks(layout)
-        self._written = segment.words[System.TICK]
+        self._written = segment.tick
         self._folder = folder
-        self._part = round(PART_S * 1e9 / layout.clock_ns)
+        self._part = layout.to_ticks(PART_S)
         self._part_ends = self._written + self._part if port is None else None
 
     def add(self, ring: str, rows: np.ndarray) -> None:
@@ -309,7 +308,7 @@ class ViewSink:
 
 def compute_block_ticks(layout: Layout) -> int:
     """Return the duration of a block in ticks."""
-    return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
+    return max(1, layout.to_ticks(BLOCK_S))
 
 
 def _build_mailbox_parts(

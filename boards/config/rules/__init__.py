@@ -42,6 +42,14 @@ def _check_standbys(wiring: Wiring) -> Mistakes:
 
 
 Rule = Callable[[Wiring], Mistakes]
+CLOCK_RULES: tuple[Rule, ...] = (
+    boards.check_clock,
+    boards.check_rates,
+    boards.check_polling,
+    boards.check_schedulers,
+    boards.check_schedule,
+)
+"""Rules that depend on the table `[clock]`."""
 RULES: tuple[Rule, ...] = (
     boards.check_boards,
     boards.check_circles,
@@ -50,11 +58,7 @@ RULES: tuple[Rule, ...] = (
     _check_network,
     levels.check_scene,
     levels.check_robot,
-    boards.check_clock,
-    boards.check_rates,
-    boards.check_polling,
-    boards.check_schedulers,
-    boards.check_schedule,
+    *CLOCK_RULES,
     mailboxes.check_strict,
     mailboxes.check_ports,
     mailboxes.check_exchange,
@@ -74,13 +78,7 @@ RULES: tuple[Rule, ...] = (
 )
 """All rules, in the order in which their mistakes are listed."""
 NEEDS: Mapping[str, tuple[Rule, ...]] = {
-    "clock": (
-        boards.check_clock,
-        boards.check_rates,
-        boards.check_polling,
-        boards.check_schedulers,
-        boards.check_schedule,
-    ),
+    "clock": CLOCK_RULES,
     "robot": (levels.check_robot, levels.check_programs),
     "scene": (levels.check_scene, levels.check_programs),
     "task": (levels.check_programs,),

@@ -177,7 +177,7 @@ def check_clock(wiring: Wiring) -> Mistakes:
     In lockstep, `speed` must be 1.
     """
     config = wiring.config
-    clock = wiring.config.clock
+    clock = config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
     if config.is_lockstep and clock.speed != 1.0:

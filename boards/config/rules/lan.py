@@ -162,7 +162,7 @@ def _explain_invalid_export(wiring: Wiring, source: str) -> Iterator[str]:
     elif source in wiring.operator_mailboxes:
         yield "operator commands stay in their rack; only mailboxes of levels can be exported"
     elif not wiring.is_known(source):
-        yield f"no such mailbox; mailboxes: {wiring.mailbox_names}"
+        yield f"no such mailbox; mailboxes: {', '.join(wiring.types)}"
     elif source in wiring.writers and board in wiring.periods:
         every = wiring.periods[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
@@ -177,8 +177,7 @@ def move_to_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
     if table is None or mistake.place == BOARD_PLACE:
         return mistake
     if mistake.place == f"{BOARD_PLACE}.executor":
-        why = mistake.why if find_spec("zenoh") else INSTALL
-        return Mistake(PLACE, None, why)
+        return Mistake(PLACE, None, mistake.why if find_spec("zenoh") else INSTALL)
     port = mistake.place.removeprefix(_MAILBOX)
     if port != mistake.place and port in table.imports:
         return Mistake(f"{PLACE}.import.{port}.type", table.imports[port].type, mistake.why)
@@ -282,23 +281,23 @@ def check_credentials(config: RackConfig) -> Mistakes:
         )
 
 
-def list_network_notes(config: RackConfig) -> list[str]:
-    """Return notes for the launch about open endpoints and certificates that expire soon."""
+def list_network_notes(config: RackConfig) -> Iterator[str]:
+    """Yield notes for the launch about open endpoints and certificates that expire soon."""
     table = config.adapter.lan
     if table is None:
-        return []
+        return
     exposed = _list_open_endpoints(table)
     attack = "read and forge messages"
     if table.certificates is not None:
         attack = "read messages, and pretend that racks come and go"
-    notes = [f"no TLS: whoever reaches {', '.join(exposed)} can {attack}"] if exposed else []
+    if exposed:
+        yield f"no TLS: whoever reaches {', '.join(exposed)} can {attack}"
     if table.certificates is not None and has_tls(table):
         from rack.boards.lan.credentials import Credentials
 
         expires = Credentials(Path(table.certificates), config.name).expiry_time
         if expires - datetime.now(UTC) < EXPIRY_WARNING:
-            notes.append(
+            yield (
                 f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC; after that the other racks"
                 " are lost"
             )
-    return notes

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from rack.backplane.layout import TICK_PROTOCOLS
 from rack.backplane.mailbox.queue import get_position_mailbox
 from rack.backplane.message import State
@@ -20,7 +18,8 @@ PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 def check_ports(wiring: Wiring) -> Mistakes:
     """Check that the classes of tasks can be used and that their ports can be connected."""
     for place, why in wiring.unusable_classes.items():
-        yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
+        key = "program" if place.role == "host" else place.role
+        yield Mistake(f"{place.table}.{key}", place.target, why)
     for place, ports in wiring.ports.items():
         table = place.table
         role = place.role
@@ -53,7 +52,7 @@ def check_read_mailboxes(wiring: Wiring) -> Mistakes:
             needed = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
                 yield Mistake(
-                    place, mailbox, f"no task writes it; mailboxes: {wiring.mailbox_names}"
+                    place, mailbox, f"no task writes it; mailboxes: {', '.join(wiring.types)}"
                 )
             elif (
                 ports.is_whole
@@ -188,14 +187,10 @@ def check_operator_mailboxes(wiring: Wiring) -> Mistakes:
 def check_protocol_tables(wiring: Wiring) -> Mistakes:
     """Check that every mailbox in the tables of `[protocol]` exists."""
     table = wiring.config.protocol
-    entries: list[tuple[str, Mapping[str, object]]] = [
-        ("mailbox", table.mailbox),
-        ("depth", table.depth),
-    ]
-    for key, listed in entries:
-        for mailbox, value in listed.items():
+    for key in ("mailbox", "depth"):
+        for mailbox, value in getattr(table, key).items():
             if not wiring.is_known(mailbox):
-                why = f"no such mailbox; mailboxes: {wiring.mailbox_names}"
+                why = f"no such mailbox; mailboxes: {', '.join(wiring.types)}"
                 yield Mistake(f"protocol.{key}.{mailbox}", value, why)
 
 

@@ -77,7 +77,7 @@ def test_interrupts_are_part_of_computing_and_of_a_plan(small: Path) -> None:
     # It is not known when a plan comes, so all messages may come at once.
     cost = timing.compute_interrupted_ns("lower")
     assert cost == sum(source.service_ns for source in inbox.sources)
-    level = timing.build_level("lower")
+    level = timing.levels["lower"]
     assert (level.read_ns, level.execution_ns) == (100_000, 500_000 + cost)
     assert {task.name: task.cost_ns for task in timing.tasks}["lower"] == 600_000 + cost
     assert level.plan_ns == 2_000_000 + timing.compute_interrupted_ns("lower.planner")

@@ -57,7 +57,7 @@ def test_the_times_of_a_cycle_lie_between_its_stamps() -> None:
     assert trace_times.compute_duration_ns(rows).tolist() == [100, 15]
     assert trace_times.compute_execution_ns(rows).tolist() == [40, 4]
     assert trace_times.compute_communication_ns(rows).tolist() == [60, 11]
-    assert trace_times.compute_residual_ns(rows, 100).tolist() == [-10, 75]
+    assert (100 - trace_times.compute_response_ns(rows)).tolist() == [-10, 75]
     assert trace_times.compute_gaps_ns(rows).tolist() == [2000]
 
 

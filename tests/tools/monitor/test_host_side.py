@@ -48,7 +48,7 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
 ) -> None:
     segment = make_segment(load(hosted, [f"name={rack_name}"]))
     newest = NewestMessages(segment)
-    assert list_entry_rows(newest) == ()
+    assert [*list_entry_rows(newest)] == []
     writer = open_writer(segment, "bridge.status")
     for entry, counts in (
         ("numbers", {"passed": 7, "refused": 2, "age": 4}),
@@ -59,10 +59,10 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
     writer.write(0)
     writer.close()
     age_ms = 4 * segment.layout.clock_ns * 1e-6
-    assert list_entry_rows(newest) == (
+    assert [*list_entry_rows(newest)] == [
         EntryRow("bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms),
         EntryRow("bridge.sum", "adder.status", 0, 0, 3, 5, 1, None),
-    )
+    ]
 
 
 @pytest.mark.thorough

@@ -136,7 +136,7 @@ def test_equations_of_a_tight_planner_do_not_apply_to_a_loose_or_unknown_one(
     judged = judge(*settings)
     found = {v.equation for v in judged.verdicts if v.subject == "lower"}
     assert not found & {"3.8", "3.9", "3.10"}
-    assert (judged.timing.build_level("lower").within_cycles is None) == (settings != LOOSE)
+    assert (judged.timing.levels["lower"].within_cycles is None) == (settings != LOOSE)
 
 
 def test_a_response_without_bound_is_none_as_plain_data(judge: Judge) -> None:

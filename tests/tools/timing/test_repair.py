@@ -108,7 +108,7 @@ def test_boards_are_repaired_one_after_another(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
     repaired = find_repair(judged)
     assert [changes[0].board for changes in repaired.steps] == ["lower", "upper"]
-    assert repaired.remaining_failures == ()
+    assert repaired.end.failures == ()
     assert repaired.end.failures == ()
     # The second step builds on the first.
     assert repaired.end.config.board["lower"].within_cycles == 2
@@ -121,8 +121,8 @@ def test_a_failure_that_no_change_removes_is_named(judge: Judge) -> None:
     hopeless = find_repair(judge("board.lower.budget.process_ms=200"))
     # Another core for the planner is not enough.
     assert [[*changes[0].settings] for changes in hopeless.steps] == [[*ELSEWHERE]]
-    assert {verdict.equation for verdict in hopeless.remaining_failures} >= {"3.1", "3.4"}
-    (line,) = format_fixes([*hopeless.list_fixes()], hopeless.remaining_failures)
+    assert {verdict.equation for verdict in hopeless.end.failures} >= {"3.1", "3.4"}
+    (line,) = format_fixes([*hopeless.list_fixes()], hopeless.end.failures)
     assert line.startswith("no change helps with 3.1 of lower, ")
     assert not hopeless.to_document()["fits"]
 
@@ -152,4 +152,4 @@ def test_two_steps_loosen_the_planner_and_lengthen_the_cycle(judge: Judge) -> No
     repaired = find_repair(judge(*(f"board.lower.budget.{time}" for time in budget)))
     keys = [[*changes[0].settings] for changes in repaired.steps]
     assert keys == [[*ELSEWHERE], ["within_cycles", "every", "rate_hz"]]
-    assert not repaired.remaining_failures
+    assert not repaired.end.failures

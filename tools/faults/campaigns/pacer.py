@@ -155,7 +155,7 @@ class ForesightedJudge(Judge):
     @property
     def quiet_ticks(self) -> int:
         """Number of ticks without reports after which a fault is settled."""
-        return round(SETTLE_S * 1e9 / self._layout.clock_ns)
+        return self._layout.to_ticks(SETTLE_S)
 
     def find_certain_tick(self, tick: int) -> int | None:
         """Return the first tick at which all judgements are final, whatever happens later.

@@ -456,7 +456,7 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
         process_ms: X, the processor time of the executor in a cycle, ms.
     """
     config = load(FIG2.config, build_settings(FIG2.config, process_ms))
-    level = build_rack_timing(config, resolve_layout(config)).build_level(LEVEL)
+    level = build_rack_timing(config, resolve_layout(config)).levels[LEVEL]
     # In the pattern "RXWPU" each cycle contains U, but a whole plan needs U only once.
     each_ms = (level.residual_ns - level.update_ns) * MS
     work_ns = (level.plan_ns or 0) + level.update_ns

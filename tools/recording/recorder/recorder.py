@@ -6,7 +6,6 @@ It reads from the host side and never delays a board.
 from __future__ import annotations
 
 import os
-import select
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -17,7 +16,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rack.backplane.process import is_alive
+from rack.backplane.process import is_alive, wait_readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import RETAINED_S
@@ -228,7 +227,7 @@ class Recorder:
         # continues where the previous recorder stopped, even if that one died before it wrote a
         # row. Any other recorder begins at the current tick.
         self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
-        self._most_at_risk = round(RETAINED_S * 1e9 / layout.clock_ns) // RISKED_DIVISOR
+        self._most_at_risk = layout.to_ticks(RETAINED_S) // RISKED_DIVISOR
         self._report_progress()
 
     def __enter__(self) -> Self:
@@ -280,9 +279,7 @@ class Recorder:
     def record_until(self, until: int) -> None:
         """Record until the file descriptor `until` is readable or closed."""
         period_s = LOCKSTEP_PERIOD_S if self._words[System.LOCKSTEP] else REALTIME_PERIOD_S
-        watched = select.poll()
-        watched.register(until, select.POLLIN)
-        while not watched.poll(period_s * 1e3):
+        while not wait_readable(until, period_s):
             self.drain_rings()
         self.drain_rings()
 

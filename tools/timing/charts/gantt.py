@@ -143,11 +143,6 @@ class Gantt(NamedTuple):
     notes: tuple[str, ...]
     column_ns: int
 
-    @property
-    def span_count(self) -> int:
-        """Number of spans to draw."""
-        return sum(len(panel.chart.spans) for panel in self.panels)
-
     def format_text(self) -> str:
         """Format the chart as text."""
         panels = [
@@ -209,5 +204,5 @@ def build_gantt(
         )
     if schedule is not None:
         panels.append(schedule.build_panel(start, end))
-    shortest_ns = None if schedule is None else schedule.shortest_ns
+    shortest_ns = 0 if schedule is None else schedule.shortest_ns
     return Gantt(name, tuple(panels), tuple(notes), choose_column_ns(end - start, shortest_ns))

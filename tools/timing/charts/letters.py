@@ -63,20 +63,18 @@ def format_panel(panel: Panel, column_ns: int) -> Iterator[str]:
     yield from _format_late_jobs(panel)
 
 
-def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
+def choose_column_ns(window_ns: int, shortest_ns: int = 0) -> int:
     """Return the width of a column, in ns, which is 1, 2 or 5 times a power of ten.
 
     Args:
         window_ns: Length of the window, ns. A column is wide enough for the window to fit into
             `MAX_COLUMNS`.
-        shortest_ns: Upper limit of the width, ns, unless the window requires a wider column. None
-            for the narrowest column with which the window fits.
+        shortest_ns: Upper limit of the width, ns, unless the window requires a wider column. 0 for
+            the narrowest column with which the window fits.
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= MAX_COLUMNS * step), steps[-1])
-    fine = max(
-        (step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits
-    )
+    fine = max((step for step in steps if step <= shortest_ns), default=fits)
     return max(fits, fine)
 
 
@@ -104,7 +102,7 @@ def _format_marks(panel: Panel, lane: Lane, column_ns: int) -> str:
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= MIN_CYCLE_COLUMNS * column_ns:
-        for start in range(lane.find_cycle_start(chart.start_ns), chart.end_ns + 1, lane.cycle_ns):
+        for start in lane.list_cycle_starts(chart.start_ns, chart.end_ns + 1):
             row[(start - chart.start_ns) // column_ns] = "|"
     for job in panel.list_late_jobs(lane):
         if job.deadline_ns >= chart.start_ns:
@@ -152,7 +150,7 @@ def choose_label_times(panel: Panel, column_ns: int) -> range:
         least_ns = columns * column_ns
         # Prefer a cycle of a lane to a round number.
         step = next((cycle for cycle in cycles if least_ns <= cycle <= longest_ns), 0)
-        step = step or choose_column_ns(least_ns * MAX_COLUMNS, None)
+        step = step or choose_column_ns(least_ns * MAX_COLUMNS)
         times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
         widest = max((len(format_ms(time)) + 2 for time in times), default=0)
     return times
@@ -161,9 +159,7 @@ def choose_label_times(panel: Panel, column_ns: int) -> range:
 def _format_patterns(panel: Panel) -> Iterator[str]:
     """Yield the patterns of every lane, beginning with the most frequent one."""
     for lane in panel.lanes:
-        lane_patterns = panel.patterns.get(lane.name)
-        if lane_patterns is None:
-            continue
+        lane_patterns = panel.patterns[lane.name]
         cycles_name = "cycles without a plan" if lane.is_tight else "cycles"
         for counts, kind in ((lane_patterns.plans, "plans"), (lane_patterns.cycles, cycles_name)):
             if counts:
@@ -200,8 +196,8 @@ def _format_late_jobs(panel: Panel) -> Iterator[str]:
     """Yield the number of late jobs of each task, followed by its first late jobs in the window."""
     for lane in panel.lanes:
         for task in lane.tasks:
-            count = panel.counts.get(task)
-            if count is None or not count.late:
+            count = panel.counts[task]
+            if not count.late:
                 continue
             kind = "plans" if task == lane.planner else "cycles"
             skipped = f", {count.skipped} of them skipped" if count.skipped else ""

@@ -70,9 +70,10 @@ class Lane:
         """Name of the executor, or else of the planner."""
         return self.tasks[0]
 
-    def find_cycle_start(self, time_ns: int) -> int:
-        """Return the start of the first cycle that begins at `time_ns` or later."""
-        return time_ns + (self.phase_ns - time_ns) % self.cycle_ns
+    def list_cycle_starts(self, since_ns: int, until_ns: int) -> range:
+        """Return the starts of the cycles that begin at `since_ns` or later, before `until_ns`."""
+        first_ns = since_ns + (self.phase_ns - since_ns) % self.cycle_ns
+        return range(first_ns, until_ns, self.cycle_ns)
 
     @property
     def title(self) -> str:
@@ -184,7 +185,7 @@ def _list_plans_and_cycles(
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + start_ns * lane.cycle_ns for plan in plans for start_ns in range(slices)}
-    for start_ns in range(lane.find_cycle_start(within[0]), within[1], lane.cycle_ns):
+    for start_ns in lane.list_cycle_starts(*within):
         if start_ns in plans:
             yield start_ns, slices, True
         elif start_ns not in planned and lane.executor is not None:

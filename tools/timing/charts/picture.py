@@ -114,8 +114,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_xticks(times, [format_ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
-    title_pad = 14 if panel.frames else None
-    axes.set_title(panel.kind, fontsize=9, loc="left", pad=title_pad)
+    axes.set_title(panel.kind, fontsize=9, loc="left", pad=14 if panel.frames else None)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
 
@@ -136,7 +135,7 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
             middle_ns = (span.start_ns + span.end_ns) / 2
             axes.text(middle_ns, row, span.unit.value, ha="center", va="center", fontsize=size)
     if lane.cycle_ns >= MIN_CYCLE_FRACTION * window_ns:
-        starts = range(lane.find_cycle_start(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
+        starts = lane.list_cycle_starts(chart.start_ns, chart.end_ns + 1)
         axes.vlines(
             list(starts), low - 0.1, low + BAR_HEIGHT + 0.1, colors=GRID_COLOUR, linewidth=0.9
         )

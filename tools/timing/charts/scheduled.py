@@ -43,7 +43,7 @@ class Schedule:
         self.default_length_ns = (
             min(max(alike) + 1, MAX_DEFAULT_FRAMES) * self.frame_ns if alike else None
         )
-        self.switch_ns = round(config.timing.context_switch_ms * 1e6)
+        self.switch_ns = timing.context_switch_ns
 
     def move_to_cores(self, layout: Layout) -> None:
         """Move the tasks to the cores that a run obtained."""

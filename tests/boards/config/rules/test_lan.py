@@ -149,7 +149,7 @@ def test_a_launch_without_tls_reports_possible_attacks(tmp_path: Path, own: str)
     ):
         assert mistakes(tmp_path, listen, lan) == []
         notes = [f"no TLS: whoever reaches {listen} can {could}"] if could else []
-        assert list_network_notes(load(tmp_path / "rack.toml")) == notes
+        assert [*list_network_notes(load(tmp_path / "rack.toml"))] == notes
 
 
 def test_remote_stops_are_refused_where_others_can_impersonate(tmp_path: Path, own: str) -> None:

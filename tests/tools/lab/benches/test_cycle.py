@@ -36,7 +36,7 @@ def cycles(processor_us: int, count: int = 5) -> Cycles:
     rows["end_ns"] = rows["tick"] * 2_500_000
     rows["closed_ns"][1:] = rows["end_ns"][:-1] + 5000
     parts = np.tile(np.array([1000, 2000, 30000, 4000]), (count, 1))
-    return Cycles(TASK, 0, 0, rows, *parts.T, np.ones(count, bool), 0, 0, np.zeros(count, int))
+    return Cycles(TASK, 0, 0, rows, *parts.T, np.ones(count, bool), 0)
 
 
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:

@@ -54,7 +54,7 @@ def test_a_letter_is_no_wider_than_its_span(rack: str, end_ms: float) -> None:
 
 def test_the_numbers_of_frames_stand_above_their_columns() -> None:
     panel = build_panel("cyclic", 0.0, 150.0)
-    column_ns = choose_column_ns(150 * NS_PER_MS, None)
+    column_ns = choose_column_ns(150 * NS_PER_MS)
     frames = next(line for line in format_panel(panel, column_ns) if line.startswith("frame"))
     margin = frames.index("|")
     for number in (0, 2, 36):
