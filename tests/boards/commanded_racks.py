@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from tests.boards.conftest import CLOCK
+from tests.boards.conftest import CLOCK, format_board
 
-COMMANDED = f"""{CLOCK}
-[board.upper]
-slot = 2
-rate_hz = 50
-below = "lower"
-executor = "commanded_levels:Upper"
-
-[board.lower]
-slot = 3
-core = 1
-rate_hz = 400
-above = "upper"
-executor = "commanded_levels:Lower"
-"""
+COMMANDED = (
+    CLOCK
+    + format_board("upper", 2, "commanded_levels:Upper", rate_hz=50, below="lower")
+    + format_board("lower", 3, "commanded_levels:Lower", core=1, rate_hz=400, above="upper")
+)
 
 
 def commands(*tables: str) -> str:

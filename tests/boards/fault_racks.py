@@ -6,14 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rack.boards.config.schema import RackConfig
-from tests.boards.conftest import PLANNED, MakeConfig
+from tests.boards.conftest import PLANNED, MakeConfig, format_board
 
-DRIVEN = f"""{PLANNED}
-[board.driven]
-slot = 4
-rate_hz = 200
-executor = "fault_levels:Driven"
-"""
+DRIVEN = PLANNED + format_board("driven", 4, "fault_levels:Driven", rate_hz=200)
 PATIENCE_TICKS = 300
 """Longer than a restart in lockstep, shorter than the longest faults of a test."""
 FOLLOWED = PLANNED.replace(

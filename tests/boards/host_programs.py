@@ -36,7 +36,7 @@ class Sum(Status, version=1):
 
 
 class Adder(Executor):
-    """Adds what comes through the bridge; done once the sum has reached `goal`."""
+    """Adds what comes through the bridge."""
 
     number = Input(Number, "above.numbers")
     status = Output(Sum)
@@ -48,8 +48,7 @@ class Adder(Executor):
             if value.id and value.id != out.last:
                 out.sum += value.value
                 out.last = value.id
-        is_done = out.sum >= self.context.params.get("goal", float("inf"))
-        out.state = State.DONE if is_done else State.EXECUTING
+        out.state = State.EXECUTING
 
 
 class Host(HostProgram):

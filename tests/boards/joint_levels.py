@@ -1,5 +1,5 @@
 """A level above boards that servo joints: it moves every joint smoothly to and fro. And an arm
-whose board stalls."""
+whose board stalls, and modifications of control."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rack.levels.messages import PrimitiveStatus
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.servo.control import ArmParams
+from rack.levels.servo.modification import Hook, LawSample, Modification
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.tables import read_params
@@ -83,3 +84,27 @@ class StallingArm(ArmExecutor):
         """Drive the arm, unless it stalls: its messages are those of the last cycle then."""
         if tick % self._given.period < self._given.period - self._given.stall:
             super().process(tick)
+
+
+class Lean(Modification):
+    """Adds 4 N m to every joint."""
+
+    hook = Hook.AFTER
+
+    def modify(self, sample: LawSample) -> None:
+        sample.torque += 4.0
+
+
+class Breaks(Modification):
+    """Fails in its 100th sample."""
+
+    hook = Hook.BEFORE
+
+    def begin(self, sample: LawSample) -> None:
+        self.left = 100
+
+    def modify(self, sample: LawSample) -> None:
+        self.left -= 1
+        if not self.left:
+            sample.position[:] = np.nan
+            raise KeyError("nothing left")

@@ -47,10 +47,8 @@ class Program:
         found = []
         for path in Path("/proc").glob("[0-9]*/stat"):
             with suppress(FileNotFoundError, ProcessLookupError):
-                pid, session = (
-                    int(path.parent.name),
-                    int(path.read_text().rpartition(")")[2].split()[3]),
-                )
+                pid = int(path.parent.name)
+                session = int(path.read_text().rpartition(")")[2].split()[3])
                 if session == self.pid != pid and runs(pid):
                     found.append(pid)
         return found

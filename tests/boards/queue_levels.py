@@ -26,12 +26,6 @@ class Taken(Status, version=1):
     missing: int = field(unit="1", doc="ids between requests taken one after the other")
 
 
-def request_id(context: LevelContext, tick: int, number: int) -> int:
-    """Return the id of the n-th request of a cycle: it does not depend on what the level
-    remembers."""
-    return 1 + tick // context.every * int(context.params["burst"]) + number
-
-
 def count(requests: Reading, status: Message) -> None:
     """Check the ids of the requests taken, and count them."""
     for request in (*requests.earlier, requests.message) if requests.is_new else ():
@@ -51,8 +45,10 @@ class Asking(Executor):
     def process(self, tick: int) -> None:
         """Send the cycle's requests, and count those refused."""
         params: Mapping[str, Any] = self.context.params
+        # The ids do not depend on what the level remembers.
+        first = 1 + tick // self.context.every * int(params["burst"])
         for number in range(params["burst"] if tick < params.get("until", 1 << 60) else 0):
-            self.requests.message.id = request_id(self.context, tick, number)
+            self.requests.message.id = first + number
             self.requests.message.made_at = tick
             if self.requests.send():
                 self.status.sent += 1

@@ -2,18 +2,6 @@
 
 from __future__ import annotations
 
-from tests.boards.conftest import CLOCK
+from tests.boards.conftest import PLAIN
 
-REMEMBERING = f"""{CLOCK}
-[board.wave]
-slot = 2
-rate_hz = 400
-executor = "remembering_levels:Rememberer"
-
-[board.watch]
-slot = 3
-rate_hz = 50
-below = "wave"
-executor = "wave_levels:Watch"
-ends_run = true
-"""
+REMEMBERING = PLAIN.replace("wave_levels:Wave", "remembering_levels:Rememberer")

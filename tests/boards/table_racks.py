@@ -3,86 +3,57 @@ hole."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
-from tests.boards.conftest import CLOCK
+from tests.boards.conftest import CLOCK, format_board
 
-RESET = """
-[[row]]
-name = "reset"
-state = ["up", "down"]
-when = { new = "yes", command = "reset" }
-next = "up"
-do = ["take", "set"]
-status = "done"
 
+def _row(
+    name: str, state: str | list[str], when: str, then: str, do: list[str], status: str
+) -> str:
+    """Return a row of a table; without conditions it fires where no other does."""
+    return f"""
 [[row]]
-name = "no such command"
-state = ["up", "down"]
-when = { new = "yes", command = ["none", "unknown"] }
-next = "up"
-do = ["take"]
-status = "executing"
+name = "{name}"
+state = {json.dumps(state)}
+{f"when = {{ {when} }}" if when else "else = true"}
+next = "{then}"
+do = {json.dumps(do)}
+status = "{status}"
 """
-SAW = f"""
-start = "up"
-{RESET}
-[[row]]
-name = "count up"
-state = "up"
-when = {{ new = "no", count = ["low", "between"] }}
-next = "same"
-do = ["count up"]
-status = "executing"
 
-[[row]]
-name = "turn"
-state = "up"
-when = {{ new = "no", count = "high" }}
-next = "down"
-do = ["count down"]
-status = "executing"
 
-[[row]]
-name = "count down"
-state = "down"
-when = {{ new = "no", count = ["high", "between"] }}
-next = "same"
-do = ["count down"]
-status = "executing"
+def _table(states: list[str], then: str, *rows: str) -> str:
+    """Return a table whose first rows take commands, in all states."""
+    no_command = 'new = "yes", command = ["none", "unknown"]'
+    reset = _row("reset", states, 'new = "yes", command = "reset"', then, ["take", "set"], "done")
+    other = _row("no such command", states, no_command, then, ["take"], "executing")
+    return f'\nstart = "{states[0]}"\n{reset}{other}{"".join(rows)}'
 
-[[row]]
-name = "turn up"
-state = "down"
-when = {{ new = "no", count = "low" }}
-next = "up"
-do = ["count up"]
-status = "executing"
-"""
-SLOW = f"""
-start = "settling"
-{RESET.replace('["up", "down"]', '["settling", "resting"]').replace('next = "up"', 'next = "same"')}
-[[row]]
-name = "settle"
-state = "settling"
-else = true
-next = "resting"
-do = []
-status = "idle"
 
-[[row]]
-name = "rest"
-state = "resting"
-else = true
-next = "same"
-do = []
-status = "idle"
-"""
+UP, DOWN = ["count up"], ["count down"]
+NOT_HIGH = 'new = "no", count = ["low", "between"]'
+NOT_LOW = 'new = "no", count = ["high", "between"]'
+SAW = _table(
+    ["up", "down"],
+    "up",
+    _row("count up", "up", NOT_HIGH, "same", UP, "executing"),
+    _row("turn", "up", 'new = "no", count = "high"', "down", DOWN, "executing"),
+    _row("count down", "down", NOT_LOW, "same", DOWN, "executing"),
+    _row("turn up", "down", 'new = "no", count = "low"', "up", UP, "executing"),
+)
+SLOW = _table(
+    ["settling", "resting"],
+    "same",
+    _row("settle", "settling", "", "resting", [], "idle"),
+    _row("rest", "resting", "", "same", [], "idle"),
+)
 HOLE = SAW.replace('count = "low" }', 'count = "low", late = "no" }')
 
 
-def counting(folder: Path, more: str = "") -> str:
-    """Write the tables to `folder`; return the rack's config, with `more` for its one board."""
+def counting(folder: Path) -> str:
+    """Write the tables to `folder`; return the rack's config."""
     for name, text in (("saw", SAW), ("slow", SLOW)):
         (folder / f"{name}.toml").write_text(text)
     return f"""{CLOCK}
@@ -90,14 +61,9 @@ def counting(folder: Path, more: str = "") -> str:
 slot = 2
 every = 4
 executor = "table_levels:Counter"
-{more}
 
 [board.counter.params.tables]
 saw = "saw.toml"
 slow = "slow.toml"
 
-[board.watch]
-slot = 3
-every = 8
-executor = "wave_levels:Wave"
-"""
+{format_board("watch", 3, "wave_levels:Wave", every=8)}"""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,12 +14,11 @@ from rack.levels.servo import ServoExecutor
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder on the import path for a while."""
-    before = list(sys.path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
     extend_path([tmp_path])
-    yield tmp_path
-    sys.path[:] = before
+    return tmp_path
 
 
 def test_a_class_is_found_by_its_name() -> None:

@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message, State, Status, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.config.layout import build_field_specs
 from rack.boards.events import (
     MAX_HOLD_MS,
     NO_TORQUE,
@@ -27,6 +25,7 @@ from rack.boards.events import (
 from rack.levels.tables import GoalConfig
 from tests.backplane.bus import CLOCK_NS, task
 from tests.backplane.conftest import MakeBus
+from tests.tools.faults.test_ending import box
 
 SILENT = 40
 
@@ -54,32 +53,15 @@ class Told(Message, version=1, message="command"):
     id: int = field("u4", unit="1", doc="serial")
 
 
-def box(name: str, kind: type[Message], writer: str) -> MailboxSpec:
-    """Return a mailbox of a type, as a level's."""
-    return MailboxSpec(
-        name=name,
-        writer=writer,
-        readers=(),
-        protocol="time-slice",
-        every=1,
-        delay=1,
-        depth=8,
-        message=kind.message_type.name,
-        version=kind.message_type.version,
-        size=kind.message_type.build_dtype({}).itemsize,
-        fields=build_field_specs(kind.message_type, {}),
-    )
-
-
 @pytest.fixture
 def bus(make_bus: MakeBus) -> Segment:
     return make_bus(
         task("upper"),
         task("lower"),
-        box("upper.status", LevelStatus, "upper"),
-        box("lower.status", Braked, "lower"),
-        box("lower.scene", Scene, "lower"),
-        box("lower.command", Told, "lower"),
+        box(LevelStatus, "upper.status"),
+        box(Braked, "lower.status"),
+        box(Scene, "lower.scene"),
+        box(Told, "lower.command"),
     )
 
 

@@ -12,12 +12,25 @@ import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
 from rack.boards import Rack
-from rack.boards.config import load, resolve_layout
-from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError
+from rack.boards.config import load
 from rack.boards.events import Event
 from tests.boards.commanded_racks import commands
+from tests.boards.config.mistakes import find_mistake
+from tests.boards.conftest import format_board
 
+pytestmark = pytest.mark.slow
+JOINT_BOARDS = "rack.levels.systems.joint_boards"
+SERVO = {"rate_hz": 1000, "above": "swing", "below": "arm"}
+SHOULDER = {
+    "joints": ["j1", "j2", "j3"],
+    "modifications": {
+        "pd": {"class": "rack.levels.servo.common_modifications:JointPd"},
+        "lean": {"class": "joint_levels:Lean"},
+        "breaks": {"class": "joint_levels:Breaks"},
+    },
+}
+WRIST = {"joints": ["j4", "j5", "j6"], "gripper": True}
+BOTH = ["shoulder", "wrist"]
 TEXT = f"""
 format = 2
 name = "modified"
@@ -29,37 +42,10 @@ robot.substeps = 2
 period_ms = 1.0
 mode = "lockstep"
 
-[board.arm]
-slot = 2
-core = 1
-rate_hz = 1000
-above = ["shoulder", "wrist"]
-executor = "rack.levels.systems.joint_boards:ArmExecutor"
-
-[board.shoulder]
-slot = 3
-rate_hz = 1000
-above = "swing"
-below = "arm"
-executor = "rack.levels.systems.joint_boards:JointServo"
-params.joints = ["j1", "j2", "j3"]
-params.modifications.pd.class = "rack.levels.servo.common_modifications:JointPd"
-params.modifications.lean.class = "law_modifications:Lean"
-params.modifications.breaks.class = "law_modifications:Breaks"
-
-[board.wrist]
-slot = 4
-rate_hz = 1000
-above = "swing"
-below = "arm"
-executor = "rack.levels.systems.joint_boards:JointServo"
-params = {{ joints = ["j4", "j5", "j6"], gripper = true }}
-
-[board.swing]
-slot = 5
-rate_hz = 50
-below = ["shoulder", "wrist"]
-executor = "joint_levels:Swing"
+{format_board("arm", 2, f"{JOINT_BOARDS}:ArmExecutor", core=1, rate_hz=1000, above=BOTH)}
+{format_board("shoulder", 3, f"{JOINT_BOARDS}:JointServo", **SERVO, params=SHOULDER)}
+{format_board("wrist", 4, f"{JOINT_BOARDS}:JointServo", **SERVO, params=WRIST)}
+{format_board("swing", 5, "joint_levels:Swing", rate_hz=50, below=BOTH)}
 """
 SECONDS = 0.7
 LARGEST_STEP = 1.5 / 50 * 4.0
@@ -95,16 +81,12 @@ class Ran(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def rack_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RackConfig]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Ran]:
     path = tmp_path_factory.mktemp("modified") / "modified.toml"
     path.write_text(TEXT)
-    return lambda *settings: load(path, list(settings))
 
-
-@pytest.fixture(scope="module")
-def run(rack_of: Callable[..., RackConfig]) -> Callable[..., Ran]:
     def run(*settings: str) -> Ran:
-        with Rack(rack_of(*settings)) as rack:
+        with Rack(load(path, settings)) as rack:
             outcome = rack.run(SECONDS)
             return Ran(
                 outcome.digest,
@@ -126,7 +108,6 @@ def without(run: Callable[..., Ran]) -> Ran:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(
     switched: Ran, without: Ran
 ) -> None:
@@ -146,7 +127,6 @@ def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step
     assert np.abs(steps).max() < np.abs(in_motion).max() + LARGEST_STEP
 
 
-@pytest.mark.slow
 def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_first_switch(
     switched: Ran, without: Ran, run: Callable[..., Ran]
 ) -> None:
@@ -159,7 +139,6 @@ def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_firs
     assert differs[0] == 301
 
 
-@pytest.mark.slow
 def test_a_failed_modification_is_removed_with_its_reason_and_the_arm_continues(
     switched: Ran,
 ) -> None:
@@ -183,23 +162,18 @@ MISTAKES = {
         "has no class 'Pd'",
     ),
     "no suitable parameter": (
-        (
-            "modifications.notch={class='rack.levels.servo.common_modifications:Notch',"
-            " params={frequency=600.0}}"
-        ),
+        "modifications.notch={class='rack.levels.servo.common_modifications:Notch',"
+        " params={frequency=600.0}}",
         "board.shoulder.params.modifications.notch",
         "params.frequency = 600 Hz: must be below half the law's rate, 500 Hz",
     ),
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("setting", "place", "why"), MISTAKES.values(), ids=MISTAKES)
 def test_a_mistake_in_a_modification_is_one_line(
-    rack_of: Callable[..., RackConfig], setting: str, place: str, why: str
+    write: Callable[[str, str], Path], setting: str, place: str, why: str
 ) -> None:
-    with pytest.raises(ConfigError) as caught:
-        resolve_layout(rack_of(f"board.shoulder.params.{setting}"))
-    assert len(caught.value.mistakes) == 1
-    assert str(caught.value).startswith(place)
-    assert why in str(caught.value)
+    found = find_mistake(write("modified.toml", TEXT), f"board.shoulder.params.{setting}")
+    assert found.startswith(place)
+    assert why in found

@@ -10,15 +10,9 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.operator_table import (
-    OperatorTable,
-    Request,
-    RequestEntry,
-    RequestStage,
-)
-from rack.backplane.words import Run, System
+from rack.backplane.operator_table import OperatorTable, Request, RequestStage
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
@@ -27,10 +21,11 @@ from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.config.mistakes import find_mistake
 from tests.boards.conftest import MakeConfig
-from tests.boards.runs import faulty
+from tests.boards.runs import faulty, stop, watch_until
 from tests.boards.runs import kill as kill_at
 from tests.processes import FORKS, forked, kill, wait_until
 
+pytestmark = pytest.mark.slow
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
 UPPER, LOWER = 8, 1
 SECONDS = 1.0
@@ -60,7 +55,6 @@ def first(rows: np.ndarray, serial: int) -> int:
     return int(rows["tick"][np.argmax(rows["message"]["operator"] >= serial)])
 
 
-@pytest.mark.slow
 def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(
     commanded: Callable[..., RackConfig],
 ) -> None:
@@ -99,7 +93,6 @@ set_either_way = pytest.mark.parametrize("level", [BY_ITSELF, BY_ITS_BOARD])
 """Whether a level takes the operator's commands itself, or leaves live parameters to its board."""
 
 
-@pytest.mark.slow
 @set_either_way
 def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_values(
     commanded: Callable[..., RackConfig], level: str
@@ -120,7 +113,6 @@ def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_value
     ]
 
 
-@pytest.mark.slow
 @set_either_way
 def test_a_restarted_board_has_its_live_params_as_they_were_set(
     commanded: Callable[..., RackConfig], level: str
@@ -132,7 +124,6 @@ def test_a_restarted_board_has_its_live_params_as_they_were_set(
     assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "line"),
     {
@@ -149,7 +140,6 @@ def test_an_impossible_setting_is_refused_in_one_line(table: str, line: str) -> 
     assert find_mistake(COMMANDED, commands(table)) == line
 
 
-@pytest.mark.slow
 def test_a_refused_command_is_answered_and_not_passed_down(
     commanded: Callable[..., RackConfig],
 ) -> None:
@@ -160,7 +150,6 @@ def test_a_refused_command_is_answered_and_not_passed_down(
     assert not boxes["lower.status"]["message"]["operator"].any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
 def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     commanded: Callable[..., RackConfig], board: str
@@ -184,23 +173,25 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     )
 
 
-@pytest.mark.slow
 def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)
         entry = rack.command("lower", "hold")
-        await_giving(rack, entry)
+        watch_until(rack, lambda: entry.stage == RequestStage.GIVEN)
         status = open_observer(rack.segment, "lower.status")
-        watch(rack, lambda: answered(status.peek(), entry.serial))
+        watch_until(
+            rack,
+            lambda: (
+                (reading := status.peek()).has_message and reading.message.order == entry.serial
+            ),
+        )
         later = rack.segment.words[System.TICK] + 40
         second = rack.command("lower", "resume", tick=later)
-        await_giving(rack, second)
+        watch_until(rack, lambda: second.stage == RequestStage.GIVEN)
         assert second.given_tick >= later
-        rack.stop("tried")
-        watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
+        assert stop(rack).cause == "stopped"
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_a_command_is_issued_only_while_its_client_lives(
@@ -223,27 +214,3 @@ def test_a_command_is_issued_only_while_its_client_lives(
             MailboxRing(rack.segment, "upper.operator").read_new_rows().rows["tick"].tolist()
             == [50, 100][: 2 - is_killed]
         )
-
-
-def await_giving(rack: Rack, entry: RequestEntry) -> None:
-    watch(rack, lambda: entry.stage == RequestStage.GIVEN)
-
-
-def answered(reading: Reading, serial: int) -> bool:
-    return reading.has_message and reading.message.order == serial
-
-
-def watch(rack: Rack, condition: Callable[[], bool]) -> None:
-    wait_until(lambda: condition() or not rack.watch(0.001) or condition())
-
-
-@pytest.mark.parametrize(
-    ("protocol", "why"),
-    [
-        ("lock", "the clock writes it and must not wait"),
-        ("interrupt", "the clock writes it, not a board; must be time-slice or double-buffer"),
-    ],
-)
-def test_the_clock_takes_no_lock_for_an_operator(protocol: str, why: str) -> None:
-    setting = f"protocol.mailbox={{'upper.operator' = '{protocol}'}}"
-    assert why in find_mistake(COMMANDED, setting)

@@ -15,40 +15,25 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.config.mistakes import find_lines, find_mistake
-from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.conftest import CLOCK, MakeConfig, format_board
 from tests.boards.fault_racks import inline
 from tests.boards.runs import faulty, kill, stop, watch_until
 
-QUEUES = f"""{CLOCK}
-[board.upper]
-slot = 2
-core = 1
-rate_hz = 10
-executor = "queue_levels:Asking"
-params = {{ burst = 3 }}
-
-[board.lower]
-slot = 3
-rate_hz = 4
-above = "upper"
-executor = "queue_levels:Answering"
-"""
+QUEUES = (
+    CLOCK
+    + format_board("upper", 2, "queue_levels:Asking", core=1, rate_hz=10, params={"burst": 3})
+    + format_board("lower", 3, "queue_levels:Answering", rate_hz=4, above="upper")
+)
 FAST = (
     "board.upper.rate_hz=100",
     "board.lower.rate_hz=50",
     # Room for what is sent during a restart that takes ten seconds.
     "protocol.depth={ 'upper.requests' = 4096 }",
 )
-PLANNING = f"""{CLOCK}
-[board.wave]
-slot = 2
-rate_hz = 50
-executor = "queue_levels:Steady"
-planner = "queue_levels:Stepping"
-coupling = "tight"
-within_cycles = 2
-params = {{ burst = 5 }}
-"""
+PLANNER = {"planner": "queue_levels:Stepping", "coupling": "tight", "within_cycles": 2}
+PLANNING = CLOCK + format_board(
+    "wave", 2, "queue_levels:Steady", rate_hz=50, params={"burst": 5}, **PLANNER
+)
 
 
 def counts(rack: Rack, board: str) -> dict[str, int]:
@@ -158,36 +143,30 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    ("setting", "expected"),
     [
         (
-            (
-                (
-                    "board.third={ slot = 4, every = 1, above = 'upper', executor ="
-                    " 'queue_levels:Answering' }"
-                ),
-            ),
-            (
-                "mailbox upper.requests: a queue gives each message once, so it has one reader, not"
-                " 2: lower (requests)"
-            ),
+            "board.third={ slot = 4, every = 1, above = 'upper', executor ="
+            " 'queue_levels:Answering' }",
+            "mailbox upper.requests: a queue gives each message once, so it has one reader, not"
+            " 2: lower (requests)",
         ),
-        (("board.lower.reads.requests=lower.requests",), "no task writes it"),
-        (("protocol.default=queue",), 'protocol.default = "queue"'),
+        ("board.lower.reads.requests=lower.requests", "no task writes it"),
+        ("protocol.default=queue", 'protocol.default = "queue"'),
         (
-            ("protocol.mailbox={ 'upper.requests' = 'time-slice' }",),
+            "protocol.mailbox={ 'upper.requests' = 'time-slice' }",
             "sends any number of messages in a cycle",
         ),
         (
-            ("protocol.depth={ 'upper.status' = 3 }",),
+            "protocol.depth={ 'upper.status' = 3 }",
             "it is not a queue and holds one message; queues: upper.requests",
         ),
-        (("protocol.depth={ 'upper.nothing' = 3 }",), "no such mailbox"),
-        (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),
+        ("protocol.depth={ 'upper.nothing' = 3 }", "no such mailbox"),
+        ("protocol.depth={ 'upper.requests' = 0 }", "protocol.depth"),
     ],
 )
-def test_invalid_queues_are_refused_in_one_line(settings: tuple[str, ...], expected: str) -> None:
-    assert sum(expected in line for line in find_lines(QUEUES, *settings)) == 1
+def test_invalid_queues_are_refused_in_one_line(setting: str, expected: str) -> None:
+    assert sum(expected in line for line in find_lines(QUEUES, setting)) == 1
 
 
 def test_a_queue_without_a_reader_is_refused() -> None:

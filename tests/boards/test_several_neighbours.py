@@ -74,7 +74,7 @@ def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> Non
 def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
     jointed: MakeConfig,
 ) -> None:
-    config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'vector_levels:Lone' }")
+    config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'wave_levels:Wave' }")
     supervision = RestartPolicy(config, resolve_layout(config))
     lost = ["path", "watch", "joint2", "arm", "clock"]
     rounds = []

@@ -106,12 +106,3 @@ class Misled(JointLevel):
     """Names an input that it does not have."""
 
     part = Output(TestPart, rests_on=ArmLevel.parts)
-
-
-class Lone(Executor):
-    """A board without neighbours."""
-
-    status = Output(TestSeen)
-
-    def process(self, tick: int) -> None:
-        """Report nothing."""

@@ -3,37 +3,26 @@ one."""
 
 from __future__ import annotations
 
-from tests.boards.conftest import CLOCK
+from tests.boards.conftest import CLOCK, format_board
 
 NAMES = ("joint1", "joint2", "joint3")
-_LISTED = '["joint1", "joint2", "joint3"]'
-JOINTED = f"""{CLOCK}
-[board.path]
-slot = 2
-rate_hz = 50
-below = {_LISTED}
-executor = "vector_levels:PathLevel"
-budget = {{ read_ms = 0.1, process_ms = 0.5, write_ms = 0.1 }}
-""" + "".join(
-    f"""
-[board.{name}]
-slot = {3 + at}
-core = {at % 2}
-rate_hz = 400
-above = "path"
-below = "arm"
-executor = "vector_levels:JointLevel"
-params = {{ joint = {at} }}
-budget = {{ read_ms = 0.05, process_ms = 0.2, write_ms = 0.05 }}
-"""
-    for at, name in enumerate(NAMES)
+
+
+def _budget(read_ms: float, process_ms: float, write_ms: float) -> dict[str, float]:
+    return {"read_ms": read_ms, "process_ms": process_ms, "write_ms": write_ms}
+
+
+_PATH = {"rate_hz": 50, "below": NAMES, "budget": _budget(0.1, 0.5, 0.1)}
+_JOINT = {"rate_hz": 400, "above": "path", "below": "arm", "budget": _budget(0.05, 0.2, 0.05)}
+_ARM = {"rate_hz": 400, "above": NAMES, "budget": _budget(0.1, 0.3, 0.05)}
+JOINTED = (
+    CLOCK
+    + format_board("path", 2, "vector_levels:PathLevel", **_PATH)
+    + "".join(
+        format_board(
+            name, 3 + at, "vector_levels:JointLevel", core=at % 2, params={"joint": at}, **_JOINT
+        )
+        for at, name in enumerate(NAMES)
+    )
+    + format_board("arm", 9, "vector_levels:ArmLevel", core=1, **_ARM)
 )
-JOINTED += f"""
-[board.arm]
-slot = 9
-core = 1
-rate_hz = 400
-above = {_LISTED}
-executor = "vector_levels:ArmLevel"
-budget = {{ read_ms = 0.1, process_ms = 0.3, write_ms = 0.05 }}
-"""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import pytest
-
 from rack.boards.config import RackConfig, load, resolve
 from rack.boards.config.files import Assembled
 from rack.boards.config.loader import validate
@@ -23,13 +21,24 @@ def read_config(
     return validate(Assembled(apply_settings(parse_tables(str(config)), settings, [])))
 
 
+def list_mistakes(
+    config: str | Path, *settings: str, faults: str | Path | None = None
+) -> list[Mistake]:
+    """Return all mistakes of a config with these settings; of a valid one none."""
+    try:
+        resolve(read_config(config, settings, faults))
+    except ConfigError as error:
+        return error.mistakes
+    return []
+
+
 def find_mistakes(
     config: str | Path, *settings: str, faults: str | Path | None = None
 ) -> list[Mistake]:
-    """Return all mistakes of a config with these settings."""
-    with pytest.raises(ConfigError) as error:
-        resolve(read_config(config, settings, faults))
-    return error.value.mistakes
+    """Return all mistakes of a config that is not valid with these settings."""
+    found = list_mistakes(config, *settings, faults=faults)
+    assert found
+    return found
 
 
 def find_mistake(config: str | Path, *settings: str) -> str:

@@ -11,25 +11,20 @@ from pathlib import Path
 import pytest
 
 from tests.boards.config.mistakes import find_mistake, find_mistakes
+from tests.boards.conftest import format_board
 
 Write = Callable[[str, str], Path]
-FIGURE = 'executor = "rack.levels.systems.figures:FigureLoop"'
-
-
-def board(name: str, slot: int, rest: str) -> str:
-    return f"[board.{name}]\nslot = {slot}\n{rest}\n"
-
-
+FIGURE = "rack.levels.systems.figures:FigureLoop"
 STAGES = {
     "timing.small_share": "[timing]\nsmall_share = 2\n",
-    "board.one.slot": board("one", 99, f"every = 1\n{FIGURE}"),
-    "board.two.executor": board("two", 5, 'every = 1\nexecutor = "nowhere:Nothing"'),
-    "board.three.reads.nothing": board(
-        "three", 6, f'every = 1\n{FIGURE}\nreads = {{ nothing = "lower.status" }}'
+    "board.one.slot": format_board("one", 99, FIGURE, every=1),
+    "board.two.executor": format_board("two", 5, "nowhere:Nothing", every=1),
+    "board.three.reads.nothing": format_board(
+        "three", 6, FIGURE, every=1, reads={"nothing": "lower.status"}
     ),
-    "board.four.rate_hz": board("four", 7, f"rate_hz = 333\n{FIGURE}"),
-    "board.five.params.nothing": board("five", 8, f"every = 1\n{FIGURE}\nparams.nothing = 1"),
-    "board.six.above": board("six", 9, f'every = 1\n{FIGURE}\nabove = "nobody"'),
+    "board.four.rate_hz": format_board("four", 7, FIGURE, rate_hz=333),
+    "board.five.params.nothing": format_board("five", 8, FIGURE, every=1, params={"nothing": 1}),
+    "board.six.above": format_board("six", 9, FIGURE, every=1, above="nobody"),
     "protocol.strict_": "[protocol]\nstrict_ = true\n",
     "record": '[record]\nbefore = "1s"\n',
     "fault.kind": '[[fault]]\nkind = "bogus"\nboard = "lower"\n',

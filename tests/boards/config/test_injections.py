@@ -70,12 +70,6 @@ MISTAKES: list[tuple[Fault, str]] = [
 PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]
 
 
-def fault_of(kind: Kind, **keys: Any) -> Fault:
-    """Return a fault of that kind with a target that can have it."""
-    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
-    return {"kind": kind.name, "board": board, **keys}
-
-
 @cache
 def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Levels, Layout]:
     """Return the rack that can have every kind, but for those that need locks, or real time."""
@@ -87,7 +81,8 @@ def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Levels, Layout]:
 
 def mistake_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
     """Return the one mistake that a fault of that kind has, as its line."""
-    fault = FaultConfig.model_validate(fault_of(kind, **keys))
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    fault = FaultConfig.model_validate({"kind": kind.name, "board": board, **keys})
     rack = rack_for(kind.where == "lock", lockstep)
     (mistake,) = find_fault_mistakes([("fault[0]", fault)], *rack)
     return str(mistake)

@@ -89,9 +89,7 @@ def test_interrupts_are_part_of_computing_and_of_a_plan(small: Path) -> None:
 
 @pytest.mark.parametrize(("depth", "holds"), [(BOARDS - 1, True), (BOARDS - 2, False)])
 def test_an_inbox_that_a_burst_overflows_fails(depth: int, holds: bool) -> None:
-    config = load_text(
-        RACK.replace('"interrupt"', f'"interrupt"\nprotocol.interrupt.depth = {depth}')
-    )
+    config = load_text(RACK.replace('"interrupt"', f'"interrupt"\ninterrupt.depth = {depth}'))
     verdicts = evaluate_rack(build_rack_timing(config, resolve_layout(config)))
     (found,) = [verdict for verdict in verdicts if verdict.equation == INBOX]
     assert (found.subject, found.left, found.right) == ("hub", BOARDS - 1, depth)

@@ -14,23 +14,15 @@ from rack.boards.config.layout import find_core
 from rack.boards.config.rules import apply_rules
 
 
-def test_mailboxes_have_one_writer_and_the_readers_that_the_levels_name(small: Path) -> None:
+def test_mailboxes_have_the_readers_that_levels_name_and_the_delay_of_their_writers_slice(
+    small: Path,
+) -> None:
     layout = resolve_layout(load(small))
-    assert {m.name: (m.writer, m.readers) for m in layout.mailboxes} == {
-        "upper.command": ("upper", ("lower", "lower.planner")),
-        "upper.status": ("upper", ()),
-        "lower.status": ("lower", ("upper",)),
-        "lower.plan": ("lower.planner", ("lower",)),
-    }
-
-
-def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
-    layout = resolve_layout(load(small))
-    assert {m.name: (m.every, m.delay) for m in layout.mailboxes} == {
-        "upper.command": (8, 8),
-        "upper.status": (8, 8),
-        "lower.status": (1, 1),
-        "lower.plan": (1, 4),
+    assert {m.name: (m.writer, m.readers, m.every, m.delay) for m in layout.mailboxes} == {
+        "upper.command": ("upper", ("lower", "lower.planner"), 8, 8),
+        "upper.status": ("upper", (), 8, 8),
+        "lower.status": ("lower", ("upper",), 1, 1),
+        "lower.plan": ("lower.planner", ("lower",), 1, 4),
     }
 
 

@@ -14,6 +14,7 @@ from rack.boards.config.files import append_faults, assemble
 from rack.boards.config.reference import Key, find_tables, list_key_tables
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import MakeConfig
+from tests.reference import PAGE, page
 
 UNITS = {
     "",
@@ -126,3 +127,7 @@ def test_the_events_of_a_users_own_level_are_in_the_reference(config: MakeConfig
 def test_an_unknown_table_is_refused_with_the_known_tables() -> None:
     with pytest.raises(LookupError, match=r"no such table; tables: rack, clock, protocol, .*task"):
         find_tables("bord", load("nasrem"))
+
+
+def test_the_page_of_all_keys_is_up_to_date() -> None:
+    assert PAGE.read_text() == page(), "make reference writes it anew"

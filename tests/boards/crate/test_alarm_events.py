@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import DamageError
 from rack.backplane.fault_table import FaultTable
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import (
     BRAKED_BY_DEMAND,
     BRAKED_WITHOUT_TORQUE,
@@ -28,7 +28,7 @@ from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.events import Event
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, MakeSegment
 from tests.boards.fault_racks import rack
 
 JOINTS = ("shoulder", "elbow")
@@ -65,26 +65,13 @@ KINDS = {
 
 
 @pytest.fixture
-def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
+def segment(config: MakeConfig, make_segment: MakeSegment) -> Segment:
     found = rack(config, *FAULTS)
     layout = resolve_layout(found)
-    made = Segment.create(layout, found.to_toml_text())
+    made = make_segment(layout, found.to_toml_text())
     for fault in build_injections(found, layout):
         FaultTable(made).add_fault(fault)
-    yield made
-    made.close()
-    unlink_segment(rack_name)
-
-
-def alarm_events(
-    segment: Segment,
-    geom: Callable[[int], str] = str,
-    names: tuple[str, ...] = ("first", "second"),
-) -> AlarmReader:
-    wave = PublishedLevel(names=names, findings=FINDINGS)
-    reader = AlarmReader(segment)
-    reader._joints, reader._geom, reader._levels = JOINTS, geom, {"wave": wave}
-    return reader
+    return made
 
 
 def heard(
@@ -95,11 +82,15 @@ def heard(
     value: float = 0.0,
     since: int | None = None,
     text: str = "",
+    geom: Callable[[int], str] = str,
 ) -> Event:
     """Ring an alarm at tick 400 and return the event that it makes."""
     AlarmWriter(segment, owner).raise_alarm(400, alarm, subject, value, since, text)
     row = open_alarm_ring(segment, owner).read_new_rows().rows[-1]
-    return alarm_events(segment).build_event(row, owner)
+    wave = PublishedLevel(names=("first", "second"), findings=FINDINGS)
+    reader = AlarmReader(segment)
+    reader._joints, reader._geom, reader._levels = JOINTS, geom, {"wave": wave}
+    return reader.build_event(row, owner)
 
 
 @pytest.mark.parametrize(
@@ -261,8 +252,7 @@ def test_a_collision_names_both_geoms(segment: Segment) -> None:
     assert config.robot is not None
     cell = build_cell(config.robot, config.scene, config.clock_ns)
     post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
-    AlarmWriter(segment, "wave").raise_alarm(400, Alarm.COLLISION, post, palm)
-    row = open_alarm_ring(segment, "wave").read_new_rows().rows[-1]
-    event = alarm_events(segment, partial(find_geom_name, config)).build_event(row, "wave")
+    geom = partial(find_geom_name, config)
+    event = heard(segment, "wave", Alarm.COLLISION, post, palm, geom=geom)
     assert (event.code, event.subject) == ("collision", "post")
     assert event.text == "unintended contact: 'post' touches 'palm'"

@@ -19,6 +19,7 @@ from rack.boards.errors import LaunchError
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import parent_of, wait_until
 
+pytestmark = pytest.mark.slow
 EXCLUSIVE = ("clock.mode=realtime", "clock.exclusive_cores=true", "clock.speed=0.1")
 HIERARCHY = find_hierarchy()
 needs_groups = pytest.mark.skipif(
@@ -36,7 +37,6 @@ def refuse(rack: str, cores: Iterable[int]) -> str:
     return f"core {max(cores)}: root invalid (Parent unable to distribute cpu downstream)"
 
 
-@pytest.mark.slow
 def test_a_refusal_is_a_note_or_ends_the_launch(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -55,7 +55,6 @@ def test_a_refusal_is_a_note_or_ends_the_launch(
     assert error.value.status == 2
 
 
-@pytest.mark.slow
 def test_in_lockstep_a_rack_shares_its_cores(config: MakeConfig) -> None:
     with Rack(config("clock.exclusive_cores=true", text=PLAIN)) as rack:
         rack.run(0.02)
@@ -71,7 +70,6 @@ def make_groups(rack: str, cores: Iterable[int]) -> str:
     return ""
 
 
-@pytest.mark.slow
 @needs_groups
 @pytest.mark.parametrize("killed", ["nothing", "board", "crate"])
 def test_processes_are_in_the_groups_and_nothing_is_left(

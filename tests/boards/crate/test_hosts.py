@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from rack.backplane.process import STOPPED_STATES, read_state
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.config import resolve
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.recovery import Recovery, RestartPolicy
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
 from rack.boards.events import Event, Journal
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, MakeSegment
 from tests.boards.host.test_board import HOSTED
 from tests.processes import FORKS, forked, wait_until
 
@@ -44,28 +44,18 @@ def journal() -> Journal:
 
 
 @pytest.fixture
-def site(config: MakeConfig, journal: Journal) -> Iterator[Site]:
+def site(config: MakeConfig, make_segment: MakeSegment, journal: Journal) -> Site:
     hosted = f'{HOSTED}\n[host.prompt]\nexternal = true\nbelow = "bridge"\n'
     settings = (*SETTINGS, 'host.prompt.program="rack.levels.host_program:HostProgram"')
     made = config(*settings, text=hosted)
     plan = resolve(made)
-    segment = Segment.create(plan.layout, "")
+    segment = make_segment(plan.layout, "")
     asked: list[object] = []
-
-    class Crate:
-        """Notes what it is asked."""
-
-        def try_request(self, request: object) -> None:
-            """Note it."""
-            asked.append(request)
-
     supervision = RestartPolicy(made, plan.layout)
-    crate = cast(CrateLine, Crate())
+    crate = cast(CrateLine, SimpleNamespace(try_request=asked.append))
     recovery = Recovery(segment, supervision, crate, journal)
     recovery.start(plan.build_clock_wiring(None), plan)
-    yield Site(segment, recovery, asked)
-    segment.close()
-    unlink_segment(plan.layout.rack)
+    return Site(segment, recovery, asked)
 
 
 def told(journal: Journal) -> list[tuple[str, str]]:

@@ -93,20 +93,14 @@ def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: 
     assert int(preloaded) != os.getpid()
 
 
-def fifo(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the FIFO that a `SlowlyPreloaded` level waits for."""
-    path = folder / "may-load"
-    os.mkfifo(path)
-    monkeypatch.setenv("WAVE_MAY_LOAD", str(path))
-    return path
-
-
 @pytest.mark.slow
 def test_a_launch_reports_what_it_waits_for(
     config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rack.boards.crate.patience.PATIENCE_S", 0.1)
-    gate = fifo(tmp_path, monkeypatch)
+    # A `SlowlyPreloaded` level waits for it.
+    os.mkfifo(gate := tmp_path / "may-load")
+    monkeypatch.setenv("WAVE_MAY_LOAD", str(gate))
     waits: list[str] = []
 
     def let_it_load(event: Event) -> None:

@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from resource import RLIMIT_MEMLOCK, getrlimit
 
 import pytest
 
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.crate.launch_checks import check_realtime, list_launch_notes
 from rack.boards.errors import LaunchError
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, MakeSegment
 
 REFUSED = "SCHED_FIFO refused, ordinary scheduling for wave"
 
 
 @pytest.fixture
-def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
+def memory(config: MakeConfig, make_segment: MakeSegment) -> tuple[Resolved, Segment]:
     """A rack of which one board wants a real-time priority, and its memory."""
     plan = resolve(
         config("clock.mode=realtime", "clock.on_no_realtime=refuse", "board.wave.priority=50")
     )
-    segment = Segment.create(plan.layout, "")
-    yield plan, segment
-    unlink_segment(segment.rack)
-    segment.close()
+    return plan, make_segment(plan.layout, "")
 
 
 def test_a_refused_priority_is_noted_and_ends_the_launch_if_configured(

@@ -15,20 +15,14 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.neighbours import find_holders
 from rack.boards.errors import ConfigError
-from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
+from tests.boards.conftest import CLOCK, PLAIN, MakeConfig, format_board
 from tests.machine import needs_deadlines, needs_fifo, needs_two_cores
 from tests.processes import FORKS, RACK, exit_status, fork, forked, run_to_end, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 FIFO = ("clock.mode=realtime", "board.wave.priority=5")
-ELSEWHERE = f"""{CLOCK}
-[board.wave]
-slot = 2
-rate_hz = 400
-priority = 5
-executor = "wave_levels:Wave"
-"""
+ELSEWHERE = CLOCK + format_board("wave", 2, "wave_levels:Wave", rate_hz=400, priority=5)
 """A rack whose board names no core."""
 
 
@@ -119,7 +113,6 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.skipif(
     os.getuid() != 0 or not shutil.which("setpriv"), reason="needs to drop CAP_SYS_NICE"
 )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import random
-import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -22,13 +20,12 @@ from rack.backplane.address_map import (
     MAILBOX_HEAD_SIZE,
     compute_operator_entry_size,
 )
-from rack.backplane.errors import BackplaneError, SegmentError
+from rack.backplane.errors import BackplaneError
 from rack.backplane.mailbox.history import compute_digest
-from rack.backplane.segment import Segment, list_racks, unlink_segment
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.trace import open_trace_ring
-from rack.backplane.words import System
 from rack.boards import Rack
-from rack.boards.config import load, read_stored
+from rack.boards.config import read_stored
 from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.patience import PeerWaitReporter
@@ -40,22 +37,17 @@ from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.spool import open_rings
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.processes import RACK, named, wait_until
+from tests.boards.config.mistakes import read_config
+from tests.boards.conftest import MakeSegment
+from tests.processes import RACK, named, start_rack, wait_until
 from tests.tools.command_line import BOUND_S
-from tests.warm import Popen
 
+pytestmark = pytest.mark.slow
 SEEDS = 6
 ALARM_NUMBERS = 8 * 6
 """Bytes of an alarm before its text."""
 NOISE = 8 * 32
 """Address behind the head, whose words are checked when a program attaches."""
-
-
-class Ran(NamedTuple):
-    """A rack at the end of a run: its segment's memory, and what stands in the head's texts."""
-
-    memory: bytes
-    segment: Segment
 
 
 REGIONS = (
@@ -140,38 +132,35 @@ def looks(segment: Segment) -> dict[str, Callable[[], object]]:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    """A rack after a run with commands, faults and alarms."""
-    path = tmp_path_factory.mktemp("noise") / "rack.toml"
-    path.write_text(COMMANDED)
+def ran() -> tuple[bytes, Segment]:
+    """The memory of a rack after a run with commands, faults and alarms, and its segment."""
     told = commands('level = "upper", what = "hold", tick = 50', 'level = "lower", what = "hold"')
     fault = 'fault=[{ kind = "drop", board = "lower", tick = 60, cycles = 20 }]'
-    with Rack(load(path, [f"name=test-noise-{path.parent.name}", told, fault])) as one:
+    with Rack(read_config(COMMANDED, [f"name=test-noise-{os.getpid()}", told, fault])) as one:
         one.run(0.3)
         memory = bytes(one.segment.bytes)
         segment = one.segment
     assert {event.kind for event in one.events} >= {"fault", "detection", "command"}
-    return Ran(memory, segment)
+    return memory, segment
 
 
 @pytest.fixture
-def copy(ran: Ran, rack_name: str) -> Iterator[Segment]:
+def copy(ran: tuple[bytes, Segment], rack_name: str, make_segment: MakeSegment) -> Segment:
     """A segment like that of the rack."""
-    found = ran.segment
-    made = Segment.create(replace(found.layout, rack=rack_name), found.config, found.published)
-    yield made
-    made.close()
-    unlink_segment(rack_name)
+    _, found = ran
+    return make_segment(replace(found.layout, rack=rack_name), found.config, found.published)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("region", REGIONS)
-def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy: Segment) -> None:
+def test_every_tool_refuses_or_reads_a_damaged_rack(
+    region: str, ran: tuple[bytes, Segment], copy: Segment
+) -> None:
+    memory, _ = ran
     refused = 0
     end = copy.map.size
     for seed in range(SEEDS):
         for name in looks(copy):
-            copy.bytes[NOISE:end] = ran.memory[NOISE:end]
+            copy.bytes[NOISE:end] = memory[NOISE:end]
             look = looks(copy)[name]
             spoil(copy, region, seed)
             try:
@@ -183,53 +172,28 @@ def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy:
     assert refused or region not in REFUSED
 
 
-def has_ticked(name: str) -> bool:
-    """Return whether a rack is there and past its first ticks."""
-    try:
-        segment = Segment.attach(name)
-    except SegmentError:
-        return False
-    tick = segment.words[System.TICK]
-    segment.close()
-    return tick > 20
-
-
-@contextmanager
-def launched(path: Path, name: str) -> Iterator[subprocess.Popen[str]]:
-    """A rack in lockstep without an end, past its first ticks."""
-    path.write_text(COMMANDED)
-    process = Popen(
-        [*RACK, "run", str(path), "--no-record", "--set", f"name={name}"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        wait_until(lambda: has_ticked(name))
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothing(
     tmp_path: Path, rack_name: str
 ) -> None:
-    with launched(tmp_path / "rack.toml", rack_name) as process:
+    path, log = tmp_path / "rack.toml", tmp_path / "log"
+    path.write_text(COMMANDED)
+    command = [*RACK, "run", str(path), "--no-record", "--set", f"name={rack_name}"]
+    process = start_rack(command, rack_name, log)
+    try:
         segment = Segment.attach(rack_name)
-        assert process.poll() is None
         address = segment.map.alarms["lower"]
         count = segment.words[address // 8] + 1
         record = address + CACHE_LINE + count % ALARM_DEPTH * ALARM_RECORD_SIZE
         segment.words[record // 8 + 2] = 4711
         segment.words[address // 8] = count
         segment.close()
-        _, err = process.communicate(timeout=BOUND_S)
+        assert process.wait(BOUND_S) == 1
+    finally:
+        process.kill()
+        process.wait()
     # On a busy machine further lines of progress come before it.
-    said = [line for line in err.splitlines() if not line.startswith(rack_name)]
-    assert process.returncode == 1
+    said = [line for line in log.read_text().splitlines() if not line.startswith(rack_name)]
     assert said == ["the rack's shared memory is damaged: 4711 is not a value of Alarm"]
     assert rack_name not in list_racks()
     wait_until(lambda: not named(f"{rack_name}:"))

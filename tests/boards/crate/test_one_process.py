@@ -14,7 +14,6 @@ from tests.shared_runs import small_run
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_levels_behave_as_in_a_rack_in_lockstep(
     small: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

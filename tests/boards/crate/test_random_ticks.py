@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import random
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
-from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.lab.benches.observed import record_rack
 from rack.tools.launch.continued import RepeatedRun
@@ -24,6 +22,7 @@ from rack.tools.recording.recording import Recording
 from tests import golden
 from tests.conftest import EXHAUSTIVE
 
+pytestmark = pytest.mark.thorough
 SEED = 43
 SECONDS = 7.0
 COUNT = 25 if EXHAUSTIVE else 1
@@ -36,19 +35,16 @@ HOLDS = (
     " 5.2 }]"
 )
 RUNS = {
-    "plain": ((), None),
-    "restarts": ((), "kill-each-board"),
-    "faults": ((), "bad-sensors"),
-    "holds": ((HOLDS,), None),
+    "plain": ((), None, SECONDS, COUNT),
+    "restarts": ((), "kill-each-board", SECONDS, COUNT),
+    "faults": ((), "bad-sensors", SECONDS, COUNT),
+    "holds": ((HOLDS,), None, SECONDS, COUNT),
+    "restarts and holds": ((HOLDS,), "kill-each-board", 4.0, 2),
 }
 HOSTED_S = 3.0
 OF_SHIPPED = 10 if EXHAUSTIVE else 1
 """Random ticks of each run of the other racks."""
 SHIPPED = golden.RUNS if EXHAUSTIVE else golden.CONTINUED
-
-
-def losses_in(events: Sequence[Event]) -> tuple[tuple[str, int], ...]:
-    return tuple((event.board, event.tick) for event in events if event.kind == "died")
 
 
 def strays(config: RackConfig, seconds: float | None, count: int, expected: str = "") -> list[int]:
@@ -70,7 +66,8 @@ def strays(config: RackConfig, seconds: float | None, count: int, expected: str 
             with Rack(config, crate=crate, snapshots=wanted, continues=begins) as rack:
                 outcome = rack.run(seconds)
                 if losses is None:
-                    losses = losses_in(rack.events)
+                    died = (event for event in rack.events if event.kind == "died")
+                    losses = tuple((event.board, event.tick) for event in died)
             if outcome.digest != expected:
                 found.append(tick)
             begins = Continuation(tick, *known[:2], losses)
@@ -81,20 +78,12 @@ def strays(config: RackConfig, seconds: float | None, count: int, expected: str 
     return found
 
 
-@pytest.mark.thorough
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("run", RUNS)
 def test_nasrem_continues_from_random_ticks(run: str, rack_name: str) -> None:
-    settings, faults = RUNS[run]
+    settings, faults, seconds, count = RUNS[run]
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep", *settings], faults)
-    assert strays(config, SECONDS, COUNT) == []
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-def test_a_rack_with_restarts_and_holds_continues_from_some_ticks(rack_name: str) -> None:
-    settings = [f"name={rack_name}", "clock.mode=lockstep", HOLDS]
-    assert strays(load("nasrem", settings, "kill-each-board"), 4.0, 2) == []
+    assert strays(config, seconds, count) == []
 
 
 def rack_of(run: str, name: str) -> tuple[RackConfig, float | None]:
@@ -109,7 +98,6 @@ def rack_of(run: str, name: str) -> tuple[RackConfig, float | None]:
     return config, None if seconds is None else float(seconds)
 
 
-@pytest.mark.thorough
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("run", [run for run in SHIPPED if not run.startswith(golden.HOSTED)])
 def test_a_shipped_rack_continues_from_random_ticks(run: str, rack_name: str) -> None:
@@ -117,7 +105,6 @@ def test_a_shipped_rack_continues_from_random_ticks(run: str, rack_name: str) ->
     assert strays(config, seconds, OF_SHIPPED, golden.read()["digests"][run]) == []
 
 
-@pytest.mark.thorough
 @pytest.mark.timeout(480)
 @pytest.mark.parametrize("system", golden.HOSTED)
 def test_a_shipped_rack_with_host_programs_continues_with_their_recorded_messages(

@@ -10,15 +10,15 @@ from collections.abc import Sequence
 import pytest
 
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, System
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
+from tests.boards.crate.test_kill import TASKS, process_of
 from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill, run_until, watch_until
 
-TASKS = ("wave", "wave.planner", "watch")
 RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
 
@@ -127,12 +127,7 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
         rack.start()
         words = rack.segment.words
         watch_until(rack, lambda: words[System.TICK] >= 40)
-        pid = (
-            words[System.CLOCK_PID]
-            if victim == "clock"
-            else rack.segment.get_block(victim)[Block.PID]
-        )
-        os.kill(pid, signal.SIGKILL)
+        os.kill(process_of(rack, victim), signal.SIGKILL)
         outcome = run_until(rack, lambda: of(rack.events, "recovery", "rejoined"))
     assert (outcome.cause, outcome.is_success) == ("time over", True)
     assert [event.board for event in of(rack.events, "died")] == [victim]
@@ -172,14 +167,6 @@ def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: Make
 
         run_until(rack, lambda: "watch" in reporters())
     assert [event.board for event in of(rack.events, "died")] == ["clock"]
-
-
-@pytest.mark.slow
-def test_the_latch_is_set_before_the_start_and_reset_by_it(config: MakeConfig) -> None:
-    with Rack(config()) as rack:
-        assert rack.segment.words[System.EMERGENCY_STOP] == 1
-        rack.run(0.1)
-        assert rack.segment.words[System.EMERGENCY_STOP] == 0
 
 
 @pytest.mark.slow

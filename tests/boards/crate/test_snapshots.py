@@ -17,13 +17,13 @@ from rack.backplane.process import is_alive, list_children, wait_readable
 from rack.backplane.standby import list_standbys
 from rack.backplane.words import System
 from rack.boards import Rack
-from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.clean import remove_dead_rack
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
 from rack.boards.events import Event, Outcome
 from rack.boards.wiring import Continuation, SnapshotPolicy
+from tests.boards.config.mistakes import read_config
 from tests.boards.conftest import LOOSE, PLANNED, MakeConfig
 from tests.boards.remembering_racks import REMEMBERING
 from tests.boards.runs import digest_of, faulty, kill
@@ -109,18 +109,15 @@ def test_a_run_continues_from_each_snapshot_to_the_same_digest(
 
 LOST_AT = 150
 BACK_AT = 220
+KILLED = kill("wave", LOST_AT)
 BOARD = "board.wave.standby={slot=9,core=0}"
 BOTH = (BOARD, "board.watch.standby={slot=10,core=1}")
 CLOCK = "clock.standby={slot=11,core=0}"
 STANDBYS: Mapping[str, tuple[Sequence[str], Sequence[Mapping[str, Any]], int]] = {
-    "board, killed": ((BOARD,), (kill("wave", LOST_AT),), 1),
+    "board, killed": ((BOARD,), (KILLED,), 1),
     "board, hanging": ((BOARD,), ({"kind": "hang", "board": "wave", "tick": LOST_AT},), 1),
-    "board, both killed": (
-        (BOARD,),
-        (kill("wave", LOST_AT), kill("wave.standby", BACK_AT + 50)),
-        2,
-    ),
-    "two boards, killed": (BOTH, (kill("wave", LOST_AT), kill("watch", LOST_AT)), 2),
+    "board, both killed": ((BOARD,), (KILLED, kill("wave.standby", BACK_AT + 50)), 2),
+    "two boards, killed": (BOTH, (KILLED, kill("watch", LOST_AT)), 2),
     "clock, killed": ((CLOCK,), (kill("clock", LOST_AT),), 0),
     "clock and board, both killed": (
         (CLOCK, BOARD),
@@ -132,11 +129,9 @@ STANDBYS: Mapping[str, tuple[Sequence[str], Sequence[Mapping[str, Any]], int]] =
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+def plain() -> str:
     """Digest of the rack without standbys and faults."""
-    path = tmp_path_factory.mktemp("plain") / "waves.toml"
-    path.write_text(PLANNED)
-    return digest_of(load(str(path), [f"name=test-unsnapped-{os.getpid()}"]), SECONDS)
+    return digest_of(read_config(PLANNED, [f"name=test-unsnapped-{os.getpid()}"]), SECONDS)
 
 
 @pytest.mark.parametrize(
@@ -204,22 +199,10 @@ def test_a_snapshot_contains_the_whole_state_of_a_level(
 ) -> None:
     rack = config(text=REMEMBERING.replace("Rememberer", level))
     expected = digest_of(rack, SECONDS)
-    for at in (210, 300):
-        taken(rack, crate, SnapshotPolicy(part=0, at=at))
+    assert digests_of_a_chain(rack, crate, 210, 300) == {expected}
+    assert ticks_on(crate) == [210, 300]
     for tick in (300, 210):
         assert continued(rack, crate, tick).digest == expected
-
-
-def test_a_continued_run_has_snapshots_that_can_be_continued(
-    config: MakeConfig, crate: WarmCrate
-) -> None:
-    rack = config(text=REMEMBERING.replace("Rememberer", "Holder"))
-    outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=100))
-    later = SnapshotPolicy(part=0, at=250)
-    with Rack(rack, crate=crate, continues=Continuation(100), snapshots=later) as again:
-        assert again.run(SECONDS).digest == outcome.digest
-    assert ticks_on(crate) == [100, 250]
-    assert [continued(rack, crate, at).digest for at in (260, 120)] == [outcome.digest] * 2
 
 
 def test_a_snapshot_shows_the_attributes_of_its_levels(

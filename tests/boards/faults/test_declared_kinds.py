@@ -28,18 +28,15 @@ def declared(record: Kind | Parameter) -> dict[str, Any]:
     }
 
 
-def drawn(kind: Kind) -> list[list[float]]:
-    """Return what a campaign draws for each parameter of a kind, and how long it lasts."""
-    draws = [parameter.drawn for parameter in kind.parameters] + [kind.lasts]
-    basis = Drawing(Random(7), cycle=8, reader=100, second=400.0, joints=6)
-    return [[draw(basis) for _ in range(DRAWS)] for draw in draws if draw]
-
-
 @pytest.mark.parametrize("kind", [*KINDS], ids=lambda kind: kind.name)
 def test_the_declaration_of_each_kind_is_unchanged(kind: Kind) -> None:
     parameters = [declared(parameter) for parameter in kind.parameters]
     told = [declared(kind), parameters, str(kind.bound), kind.number]
-    SNAPSHOTS.check(kind.name, {"declared": told, "drawn": drawn(kind)})
+    # What a campaign draws for each parameter, and how long the fault lasts.
+    draws = [parameter.drawn for parameter in kind.parameters] + [kind.lasts]
+    basis = Drawing(Random(7), cycle=8, reader=100, second=400.0, joints=6)
+    drawn = [[draw(basis) for _ in range(DRAWS)] for draw in draws if draw]
+    SNAPSHOTS.check(kind.name, {"declared": told, "drawn": drawn})
 
 
 def test_every_kind_of_the_project_is_known() -> None:

@@ -19,56 +19,45 @@ def injected(config: MakeConfig, *faults: dict[str, Any]) -> tuple[Injection, ..
     return build_injections(found, resolve_layout(found))
 
 
-@pytest.mark.parametrize(
-    ("begin", "tick"),
-    [
-        ({}, -1),
-        ({"tick": 40}, 40),
-        ({"tick": 0}, 0),
-        ({"at": 0.1}, 40),
-        ({"at": 0.1012}, 40),
-        ({"at": 0.1013}, 41),
-    ],
-)
-def test_a_fault_begins_at_a_tick_or_at_the_tick_nearest_to_its_time(
-    config: MakeConfig, begin: dict[str, Any], tick: int
-) -> None:
-    (found,) = injected(config, {"kind": "kill", "board": "wave", **begin})
-    assert found.tick == tick
+KILL = {"kind": "kill", "board": "wave"}
+MUTE = {"kind": "mute", "board": "wave"}
+TIMES: list[tuple[dict[str, Any], str, int]] = [
+    (KILL, "tick", -1),
+    ({**KILL, "tick": 40}, "tick", 40),
+    ({**KILL, "tick": 0}, "tick", 0),
+    # The nearest tick.
+    ({**KILL, "at": 0.1}, "tick", 40),
+    ({**KILL, "at": 0.1012}, "tick", 40),
+    ({**KILL, "at": 0.1013}, "tick", 41),
+    # Rounded down to thousandths of a tick.
+    ({**KILL, "phase": 0.2505}, "phase", 250),
+    (MUTE, "ticks", 0),
+    ({**MUTE, "for": "50ms"}, "ticks", 20),
+    ({**MUTE, "for": "1ms"}, "ticks", 1),
+    ({**MUTE, "cycles": 3}, "ticks", 3),
+    ({**MUTE, "board": "watch", "cycles": 3}, "ticks", 24),
+    # A plan takes four cycles of its planner.
+    ({**MUTE, "board": "wave.planner", "cycles": 3}, "ticks", 12),
+]
+"""Faults, and an attribute of their entries with its value."""
 
 
-@pytest.mark.parametrize(
-    ("board", "end", "ticks"),
-    [
-        ("wave", {}, 0),
-        ("wave", {"for": "50ms"}, 20),
-        ("wave", {"for": "1ms"}, 1),
-        ("wave", {"cycles": 3}, 3),
-        ("watch", {"cycles": 3}, 24),
-        # A plan takes four cycles of its planner.
-        ("wave.planner", {"cycles": 3}, 12),
-    ],
-)
-def test_a_fault_lasts_for_a_time_or_for_cycles_of_its_task(
-    config: MakeConfig, board: str, end: dict[str, Any], ticks: int
+@pytest.mark.parametrize(("fault", "name", "value"), TIMES)
+def test_begin_phase_and_length_of_a_fault_are_in_ticks(
+    config: MakeConfig, fault: dict[str, Any], name: str, value: int
 ) -> None:
-    (found,) = injected(config, {"kind": "mute", "board": board, **end})
-    assert found.ticks == ticks
+    (found,) = injected(config, fault)
+    assert getattr(found, name) == value
 
 
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
     when = f"watch.status.state=={value}"
-    (found,) = injected(config, {"kind": "kill", "board": "wave", "when": when})
+    (found,) = injected(config, {**KILL, "when": when})
     assert found.when is not None
     at, field, number = found.when
     box = resolve_layout(rack(config)).mailboxes[at]
     assert (box.name, box.fields[field].name, number) == ("watch.status", "state", State.DONE)
-
-
-def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) -> None:
-    (found,) = injected(config, {"kind": "kill", "board": "wave", "phase": 0.2505})
-    assert found.phase == 250
 
 
 def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(

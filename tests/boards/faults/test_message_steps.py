@@ -48,6 +48,17 @@ def run_with_fault(rack: Link, kind: str) -> FaultEntry | None:
     return entry
 
 
+def run_spell(rack: Link, ticks: tuple[int, int, int], kind: str, *parameters: float) -> FaultEntry:
+    """Run a link with a fault from the first of these ticks to the second, up to the last."""
+    begin, end, last = ticks
+    rack.run(0, begin)
+    entry = rack.fault(kind, *parameters)
+    rack.run(begin, end)
+    rack.heal()
+    rack.run(end, last)
+    return entry
+
+
 def forge(rack: Link, tick: int) -> None:
     assert exit_status(fork(lambda: messages.forge_message(rack.segment, NAME, tick))) == 0
 
@@ -96,11 +107,7 @@ def test_reads_with_a_fault_depend_on_ticks_alone(
 
 def test_a_dropped_message_uses_a_serial_but_fills_no_slot(link: MakeLink) -> None:
     rack = link()
-    rack.run(0, 8)
-    entry = rack.fault("drop", 0.5)
-    rack.run(8, 40)
-    rack.heal()
-    rack.run(40, 44)
+    entry = run_spell(rack, (8, 40, 44), "drop", 0.5)
     written = rack.written()
     assert len(written) == 44 - entry.count
     assert [serial for _, serial, _ in written] == [tick + 1 for tick, *_ in written]
@@ -126,11 +133,7 @@ def test_a_delayed_message_keeps_its_tick_and_comes_cycles_later(
 
 def test_reordered_messages_are_swapped(link: MakeLink) -> None:
     rack = link()
-    rack.run(0, 4)
-    rack.fault("reorder", 1.0)
-    rack.run(4, 8)
-    rack.heal()
-    rack.run(8, 10)
+    run_spell(rack, (4, 8, 10), "reorder", 1.0)
     assert [tick for tick, *_ in rack.written()] == [0, 1, 2, 3, 5, 4, 7, 6, 8, 9]
     # The older one has the newer place, so it is the one that is read.
     assert [seen.released for seen in rack.reader.seen] == [-1, 0, 1, 2, 3, 3, 4, 4, 6, 8]
@@ -138,11 +141,7 @@ def test_reordered_messages_are_swapped(link: MakeLink) -> None:
 
 def test_a_damaged_message_is_skipped_and_the_next_intact_one_is_read(link: MakeLink) -> None:
     rack = link()
-    rack.run(0, 8)
-    entry = rack.fault("corrupt", 1.0, 1)
-    rack.run(8, 10)
-    rack.heal()
-    rack.run(10, 12)
+    entry = run_spell(rack, (8, 10, 12), "corrupt", 1.0, 1)
     assert entry.count == 2
     # A writer comes first in a tick, and what it writes is visible a tick later.
     assert [seen.released for seen in rack.reader.seen[7:]] == [6, 7, 7, 7, 10]
@@ -158,9 +157,7 @@ def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
 
 def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink) -> None:
     rack = link()
-    rack.run(0, 4)
-    rack.fault("babble", 40)
-    rack.run(4, 6)
+    run_spell(rack, (4, 6, 6), "babble", 40)
     assert [tick for tick, *_ in rack.written()] == [0, 1, 2, 3] + [4] * 40 + [5] * 40
 
 

@@ -26,14 +26,6 @@ BY_ORDER = ("mute", "masquerade")
 LOCKSTEP = [kind for kind in KINDS if not kind.realtime and kind.where != "start"]
 
 
-def faults(kind: Kind) -> list[dict[str, Any]]:
-    """Return three faults of a kind, one after the other."""
-    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
-    found = [{"kind": kind.name, "board": board, **strike} for strike in STRIKES]
-    lasting = ("cycles", "for") if kind.once else ()
-    return [{key: fault[key] for key in fault if key not in lasting} for fault in found]
-
-
 RACKS = {"followed": FOLLOWED, "driven": DRIVEN}
 CASES = [
     pytest.param(kind, rack, id=f"{kind.name}, {rack}")
@@ -51,7 +43,14 @@ def test_a_fault_at_the_first_tick_acts_like_a_later_one(kind: str, config: Make
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
 def test_the_effect_of_each_fault_is_unchanged(kind: Kind, rack: str, config: MakeConfig) -> None:
-    struck = faulty(config(*OF_KINDS.get(kind.where, ()), text=RACKS[rack]), *faults(kind))
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    lasting = ("cycles", "for") if kind.once else ()
+    faults = [
+        {"kind": kind.name, "board": board}
+        | {key: value for key, value in strike.items() if key not in lasting}
+        for strike in STRIKES
+    ]
+    struck = faulty(config(*OF_KINDS.get(kind.where, ()), text=RACKS[rack]), *faults)
     parts = dict(whole_run(struck, SECONDS))
     if kind.name in BY_ORDER:
         del parts["events"]

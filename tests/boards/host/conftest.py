@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.boards.config import resolve
 from rack.boards.config.resolved import Resolved
@@ -18,7 +18,7 @@ from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.host.entries import OutwardEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.references import find_class
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, MakeSegment
 from tests.boards.host.test_board import HOSTED
 from tests.boards.host_programs import Host
 
@@ -79,27 +79,11 @@ class Site:
         return [message.value for message in values]
 
 
-MakeSite = Callable[..., Site]
-
-
 @pytest.fixture
-def make_site(config: MakeConfig) -> Iterator[MakeSite]:
-    with ExitStack() as stack:
-
-        def make(*settings: str) -> Site:
-            plan = resolve(config(*settings, text=HOSTED))
-            segment = Segment.create(plan.layout, "")
-            stack.callback(unlink_segment, plan.layout.rack)
-            stack.callback(segment.close)
-            return Site(plan, segment)
-
-        yield make
-
-
-@pytest.fixture
-def site(make_site: MakeSite) -> Site:
-    """The site of a test that needs no settings."""
-    return make_site()
+def site(request: pytest.FixtureRequest, config: MakeConfig, make_segment: MakeSegment) -> Site:
+    """The site; a test may give settings as its parameter."""
+    plan = resolve(config(*getattr(request, "param", ()), text=HOSTED))
+    return Site(plan, make_segment(plan.layout, ""))
 
 
 @pytest.fixture
@@ -115,21 +99,11 @@ def open_bus() -> Iterator[Callable[[Site], HostBus]]:
 
 
 OpenBus = Callable[[Site], HostBus]
-OpenProgram = Callable[[Site], Host]
 
 
 @pytest.fixture
-def open_program(open_bus: OpenBus) -> OpenProgram:
-    def open_it(site: Site) -> Host:
-        return connected(open_bus(site), site)
-
-    return open_it
-
-
-@pytest.fixture
-def program(open_program: OpenProgram, site: Site) -> Host:
-    """The program of a test that needs no settings."""
-    return open_program(site)
+def program(open_bus: OpenBus, site: Site) -> Host:
+    return connected(open_bus(site), site)
 
 
 def connected(bus: HostBus, site: Site) -> Host:

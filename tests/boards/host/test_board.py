@@ -6,7 +6,6 @@ from __future__ import annotations
 import inspect
 import os
 import signal
-from collections.abc import Callable
 
 import pytest
 
@@ -17,31 +16,22 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config import resolve
+from rack.boards.config.schema import RackConfig
 from rack.boards.host.bus import HostBus
 from rack.levels.errors import LevelError
-from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.conftest import CLOCK, MakeConfig, format_board
 from tests.boards.host_programs import Failing, Host
-from tests.boards.runs import end_of, stop
-from tests.processes import BOUND_S, runs, wait_until
+from tests.boards.runs import end_of, stop, watch_until
+from tests.processes import runs, wait_until
 
+BUS_ADAPTER = "rack.boards.host.bus_adapter:BusAdapter"
 HOSTED = f"""{CLOCK}
-[board.bridge]
-slot = 2
-rate_hz = 100
-below = "adder"
-executor = "rack.boards.host.bus_adapter:BusAdapter"
-ends_run = true
-
+{format_board("bridge", 2, BUS_ADAPTER, rate_hz=100, below="adder", ends_run=True)}
 [board.bridge.params.pass]
 numbers = {{ from = "program.numbers", asynchronous = true }}
 sum = {{ from = "adder.status" }}
 
-[board.adder]
-slot = 3
-rate_hz = 400
-above = "bridge"
-executor = "host_programs:Adder"
-
+{format_board("adder", 3, "host_programs:Adder", rate_hz=400, above="bridge")}
 [host.program]
 program = "host_programs:Counting"
 below = "bridge"
@@ -49,29 +39,13 @@ below = "bridge"
 """A program sends numbers through a bridge to a level that adds them."""
 
 
+def hosted(config: MakeConfig, program: str, *settings: str) -> RackConfig:
+    """Return the rack with another program."""
+    return config(f"host.program.program=host_programs:{program}", *settings, text=HOSTED)
+
+
 ENDS = ("died", "restart", "rejoined", "given_up", "done")
 """Codes of events about the process of a host board."""
-
-
-def others(**programs: str) -> str:
-    """Return the tables of more host boards, and of an entry for each that no level reads."""
-    entries = [f'{name} = {{ from = "{name}.numbers" }}\n' for name in programs]
-    tables = [
-        f'[host.{name}]\nprogram = "host_programs:{program}"\nbelow = "bridge"\n'
-        for name, program in programs.items()
-    ]
-    return HOSTED.replace("sum = {", "".join(entries) + "sum = {") + "".join(tables)
-
-
-def watch(rack: Rack, condition: Callable[[], bool]) -> None:
-    """Supervise a rack that has been started until `condition` holds, then stop it."""
-
-    def holds() -> bool:
-        rack.watch(0.01)
-        return condition()
-
-    wait_until(holds, BOUND_S)
-    stop(rack)
 
 
 def status(segment: Segment, board: str = "bridge") -> object:
@@ -85,11 +59,8 @@ def codes(rack: Rack, board: str) -> list[str]:
 
 @pytest.mark.slow
 def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: MakeConfig) -> None:
-    with Rack(
-        config(
-            "host.program.params.count=50", "protocol.depth={ 'program.numbers' = 8 }", text=HOSTED
-        )
-    ) as rack:
+    depth = "protocol.depth={ 'program.numbers' = 8 }"
+    with Rack(hosted(config, "Counting", "host.program.params.count=50", depth)) as rack:
         outcome = rack.run()
         assert (outcome.cause, status(rack.segment, "adder").sum) == ("task done", 50 * 51 / 2)
         entry = status(rack.segment).numbers
@@ -102,8 +73,7 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
 def test_a_program_that_the_end_of_the_run_interrupts_has_not_failed(
     config: MakeConfig, mode: str
 ) -> None:
-    settings = f"clock.mode={mode}", "host.program.program=host_programs:Persistent"
-    with Rack(config(*settings, text=HOSTED)) as rack:
+    with Rack(hosted(config, "Persistent", f"clock.mode={mode}")) as rack:
         rack.run(0.5)
         block = rack.segment.get_block("program")
         wait_until(lambda: block[Block.STATE] == TaskState.ENDED)
@@ -114,7 +84,14 @@ def test_a_program_that_the_end_of_the_run_interrupts_has_not_failed(
 def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side(
     config: MakeConfig,
 ) -> None:
-    text = others(hung="Waiting", failed="Failing", finished="Ending", killed="Waiting")
+    others = {"hung": "Waiting", "failed": "Failing", "finished": "Ending", "killed": "Waiting"}
+    # No level reads what they send.
+    entries = [f'{name} = {{ from = "{name}.numbers" }}\n' for name in others]
+    tables = [
+        f'[host.{name}]\nprogram = "host_programs:{program}"\nbelow = "bridge"\n'
+        for name, program in others.items()
+    ]
+    text = HOSTED.replace("sum = {", "".join(entries) + "sum = {") + "".join(tables)
     settings = ("board.bridge.ends_run=false", "host.program.program=host_programs:Console")
     settings += ("host.failed={ restarts = 1, restarts_within_s = 1e6 }",)
     with Rack(config(*settings, text=text)) as rack:
@@ -123,7 +100,8 @@ def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side
         wait_until(lambda: block[Block.PID] > 0 and rack.watch(0.01) is not None)
         os.kill(block[Block.PID], signal.SIGKILL)
         ends = {"killed": "rejoined", "failed": "given_up", "finished": "done"}
-        watch(rack, lambda: all(code in codes(rack, board) for board, code in ends.items()))
+        watch_until(rack, lambda: all(code in codes(rack, board) for board, code in ends.items()))
+        stop(rack)
         assert rack.segment.words[System.EMERGENCY_STOP] == 0
         assert (
             sum(
@@ -145,9 +123,7 @@ def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side
         printed
         == [f"host board 'failed': ValueError: no numbers (host_programs.py, line {line})"] * 2
     )
-    external = [
-        f"host.{name}.external=true" for name in ("program", "hung", "failed", "finished", "killed")
-    ]
+    external = [f"host.{name}.external=true" for name in ("program", *others)]
     with Rack(config(*settings, *external, text=text)) as alone:
         alone.run(ticks * 0.0025)
         assert find_chains(alone.segment, ticks)["adder.status"] == found
@@ -158,11 +134,10 @@ def test_a_program_that_blocks_every_signal_ends_with_its_rack_and_its_children(
     config: MakeConfig,
 ) -> None:
     # The fixture checks that no process is left.
-    with Rack(
-        config("clock.mode=realtime", "host.program.program=host_programs:Deaf", text=HOSTED)
-    ) as rack:
+    with Rack(hosted(config, "Deaf", "clock.mode=realtime")) as rack:
         rack.start()
-        watch(rack, lambda: status(rack.segment, "adder").sum > 0)
+        watch_until(rack, lambda: status(rack.segment, "adder").sum > 0)
+        stop(rack)
 
 
 def daemons(rack: Rack) -> list[int]:
@@ -174,9 +149,7 @@ def daemons(rack: Rack) -> list[int]:
 def test_a_daemon_in_another_session_ends_with_its_host_board(
     config: MakeConfig,
 ) -> None:
-    with Rack(
-        config("clock.mode=realtime", "host.program.program=host_programs:Escaping", text=HOSTED)
-    ) as rack:
+    with Rack(hosted(config, "Escaping", "clock.mode=realtime")) as rack:
         rack.start()
         wait_until(lambda: rack.watch(0.01) and bool(daemons(rack)))
         first = daemons(rack)[0]
@@ -190,9 +163,7 @@ def test_a_daemon_in_another_session_ends_with_its_host_board(
 
 @pytest.mark.slow
 def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConfig) -> None:
-    found = config(
-        "host.program.program=host_programs:Console", "host.program.external=true", text=HOSTED
-    )
+    found = hosted(config, "Console", "host.program.external=true")
     with Rack(found) as rack:
         rack.start()
         (wiring,) = resolve(found).hosts

@@ -15,7 +15,7 @@ from rack.boards.host.bus import WORD, HostBus
 from rack.levels.errors import LevelError
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Input
-from tests.boards.host.conftest import MakeSite, OpenBus, Site
+from tests.boards.host.conftest import OpenBus, Site
 from tests.boards.host_programs import Host, Sum
 from tests.processes import BOUND_S, in_thread, wait_until
 
@@ -140,10 +140,10 @@ def test_a_program_writes_scratch_words_of_its_board_alone(site: Site, open_bus:
     assert bytes(site.segment.get_bytes(0, places.size)) == before
 
 
+@pytest.mark.parametrize("site", [("clock.mode=realtime",)], indirect=True)
 def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
-    make_site: MakeSite, open_bus: OpenBus
+    site: Site, open_bus: OpenBus
 ) -> None:
-    site = make_site("clock.mode=realtime")
     bus = open_bus(site)
     site.segment.words[System.TICK] = 40
     assert bus.tick == 40
@@ -160,10 +160,8 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
     assert get_done_semaphore(site.segment, "program").value == 0
 
 
-def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
-    make_site: MakeSite, open_bus: OpenBus
-) -> None:
-    site = make_site("host.program.computing_ms=5")
+@pytest.mark.parametrize("site", [("host.program.computing_ms=5",)], indirect=True)
+def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(site: Site, open_bus: OpenBus) -> None:
     site.segment.words[System.LOCKSTEP] = 1
     site.host[Block.RELEASED] = 8
     bus = open_bus(site)

@@ -12,17 +12,16 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.entries import NEVER, EntryConfig, ReplayedEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.bare_level import BareLevel
-from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, Site, connected
+from tests.boards.host.conftest import EVERY, OpenBus, Site, connected
 from tests.boards.host_programs import Host
 
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
 
 
+@pytest.mark.parametrize("site", [("board.bridge.params.pass.numbers.most=3",)], indirect=True)
 def test_each_message_passes_once_and_in_order_up_to_the_limit_of_a_cycle(
-    make_site: MakeSite, open_program: OpenProgram
+    site: Site, program: Host
 ) -> None:
-    site = make_site("board.bridge.params.pass.numbers.most=3")
-    program = open_program(site)
     assert [program.send_number(float(k)) for k in range(1, 6)] == [True] * 5
     assert program.numbers.sent == 5
     site.cycle()
@@ -35,11 +34,8 @@ def test_each_message_passes_once_and_in_order_up_to_the_limit_of_a_cycle(
     assert site.count("numbers") == {"passed": 5, "arrived": 4, "age": 8}
 
 
-def test_only_the_newest_of_sampled_messages_passes(
-    make_site: MakeSite, open_program: OpenProgram
-) -> None:
-    site = make_site(*NEWEST)
-    program = open_program(site)
+@pytest.mark.parametrize("site", [NEWEST], indirect=True)
+def test_only_the_newest_of_sampled_messages_passes(site: Site, program: Host) -> None:
     for k in range(1, 4):
         assert program.send_number(float(k))
     site.cycle()
@@ -48,12 +44,8 @@ def test_only_the_newest_of_sampled_messages_passes(
     assert site.count("numbers") == {"passed": 1, "superseded": 2, "age": EVERY}
 
 
-@pytest.mark.parametrize("settings", [(), NEWEST])
-def test_invalid_values_are_refused_and_counted(
-    make_site: MakeSite, open_program: OpenProgram, settings: tuple[str, ...]
-) -> None:
-    site = make_site(*settings)
-    program = open_program(site)
+@pytest.mark.parametrize("site", [(), NEWEST], indirect=True)
+def test_invalid_values_are_refused_and_counted(site: Site, program: Host) -> None:
     site.cycle()
     assert program.send_number(float("nan"))
     site.cycle()
@@ -78,11 +70,10 @@ def test_messages_do_not_pass_before_the_computing_time_is_over(site: Site, prog
     assert site.count("numbers") == {"passed": 1, "arrived": EVERY, "age": EVERY}
 
 
+@pytest.mark.parametrize("site", [NEWEST], indirect=True)
 def test_a_restarted_bridge_continues_its_counters_and_repeats_its_messages(
-    make_site: MakeSite, open_program: OpenProgram
+    site: Site, program: Host
 ) -> None:
-    site = make_site(*NEWEST)
-    program = open_program(site)
     for value in (1.0, 2.0, float("nan")):
         program.send_number(value)
     site.cycle()

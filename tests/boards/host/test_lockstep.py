@@ -13,44 +13,24 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.host.bus_adapter import LONGEST_S
 from rack.tools.faults.ending import list_strikes
-from tests.boards.conftest import MakeConfig
-from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
-from tests.boards.runs import stop
+from tests.boards.conftest import MakeConfig, format_board
+from tests.boards.host.test_board import BUS_ADAPTER, ENDS, HOSTED, codes, hosted, status
+from tests.boards.runs import stop, watch_until
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.thorough
 
-SECOND = (
-    HOSTED
-    + """
-[board.second]
-slot = 4
-rate_hz = 80
-phase = 1
-executor = "rack.boards.host.bus_adapter:BusAdapter"
-
-[board.second.params.pass]
-sum = { from = "adder.status", every = 2 }
-"""
-)
+PASS = {"pass": {"sum": {"from": "adder.status", "every": 2}}}
+SECOND = HOSTED + format_board("second", 4, BUS_ADAPTER, rate_hz=80, phase=1, params=PASS)
 """The program reads through a second bridge, too."""
 SLOW = "host.program.program=host_programs:Slow"
-STRUCK = (
-    *(
-        f"{{ kind='kill', board='{board}', at={at} }}"
-        for at, board in ((0.15, "program"), (0.35, "bridge"))
-    ),
-)
+SOON = "supervision.lockstep_restart_s=0.1"
+STRUCK = "{ kind='kill', board='program', at=0.15 }, { kind='kill', board='bridge', at=0.35 }"
 
 
 def slow(config: MakeConfig, lag: float, *settings: str) -> str:
     """Return the digest of a run with a program that takes up to `lag` seconds for each number."""
-    lines = (
-        SLOW,
-        f"host.program.params.lag={lag}",
-        "supervision.lockstep_restart_s=0.1",
-        *settings,
-    )
+    lines = (SLOW, f"host.program.params.lag={lag}", SOON, *settings)
     with Rack(config(*lines, text=SECOND)) as rack:
         outcome = rack.run()
         assert (outcome.cause, outcome.faults) == ("task done", ())
@@ -63,7 +43,7 @@ def slow(config: MakeConfig, lag: float, *settings: str) -> str:
     [
         (),
         ("host.program.computing_ms=35",),
-        (f"fault=[{','.join(STRUCK)}]",),
+        (f"fault=[{STRUCK}]",),
         ("fault=[{ kind='hang', board='program', at=0.15 }]",),
     ],
     ids=["alone", "computing", "killed", "stopped"],
@@ -77,21 +57,15 @@ def test_a_run_repeats_however_long_its_program_takes(
 def test_a_fault_does_not_strike_a_finished_program_whose_process_still_exists(
     config: MakeConfig,
 ) -> None:
-    settings = (
-        "host.program.program=host_programs:Lingering",
-        "fault=[{ kind='kill', board='program', at=0.2 }]",
-    )
-    with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
+    struck = "fault=[{ kind='kill', board='program', at=0.2 }]"
+    with Rack(hosted(config, "Lingering", struck, "board.bridge.ends_run=false")) as rack:
         assert rack.run(0.5).cause == "time over"
         assert [strike.tick for strike in list_strikes(rack.segment, ())] == [-1]
 
 
 def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
-    settings = (
-        "host.program.program=host_programs:Deaf",
-        "board.bridge.executor=host_programs:HastyAdapter",
-    )
-    with Rack(config(*settings, text=HOSTED)) as rack:
+    hasty = "board.bridge.executor=host_programs:HastyAdapter"
+    with Rack(hosted(config, "Deaf", hasty)) as rack:
         outcome = rack.run()
     assert (outcome.cause, outcome.is_success) == ("board lost", False)
     (fault,) = outcome.faults
@@ -102,7 +76,7 @@ def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: Make
 
 
 def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
-    with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
+    with Rack(hosted(config, "Silent")) as rack:
         rack.start()
         block = rack.segment.get_block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
@@ -114,12 +88,13 @@ def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
 def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack(
     config: MakeConfig,
 ) -> None:
-    with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
+    with Rack(hosted(config, "Silent")) as rack:
         rack.start()
         block = rack.segment.get_block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         os.kill(block[Block.PID], signal.SIGSTOP)
-        watch(rack, lambda: "rejoined" in codes(rack, "program"))
+        watch_until(rack, lambda: "rejoined" in codes(rack, "program"))
+        stop(rack)
     assert [code for code in codes(rack, "program") if code in ENDS] == [
         "died",
         "restart",
@@ -130,10 +105,9 @@ def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack
 
 
 def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:
-    settings = ("host.program.program=host_programs:Failing", "host.program.restarts=2")
     found = []
     for _ in range(2):
-        with Rack(config(*settings, text=HOSTED)) as rack:
+        with Rack(hosted(config, "Failing", "host.program.restarts=2")) as rack:
             outcome = rack.run()
             found.append((outcome.cause, outcome.ticks, outcome.digest))
     assert found[0] == found[1]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -67,7 +66,7 @@ class Stranger:
             self._session.get(key, self._on_answer, payload=b"?", timeout=1.0)
         for name, subscribers in (("heard", self._heard), ("tokens", self._tokens)):
             self._got[name].update(
-                str(sample.key_expr) for one in subscribers for sample in _taken(one)
+                str(sample.key_expr) for one in subscribers for sample in iter(one.try_recv, None)
             )
 
     def _on_answer(self, reply: zenoh.Reply) -> None:
@@ -78,11 +77,6 @@ class Stranger:
         with suppress(zenoh.ZError):
             return {**self._got, "connected": bool(self._session.info.peers_zid())}
         return {**self._got, "connected": False}
-
-
-def _taken(channel: Any) -> Iterator[Any]:
-    while (item := channel.try_recv()) is not None:
-        yield item
 
 
 def main(sessions: str) -> None:

@@ -1,8 +1,10 @@
-"""Access control: which messages under which keys the rules allow, and to whom."""
+"""Access control: which messages under which keys the rules allow, and to whom. Nothing of what the
+libraries are told changes unseen."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import pytest
@@ -18,6 +20,8 @@ from rack.boards.lan.access import (
 )
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import alive_key, parse_alive_key
+from rack.boards.lan.link import _build_settings
+from tests.snapshots import Snapshots
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
 QUERIES = ("query", "reply")
@@ -41,11 +45,9 @@ def rules(
         for rule in map(by_id.__getitem__, policy["rules"]):
             assert rule["permission"] == "allow"
             for subject in policy["subjects"]:
-                for flow in rule["flows"]:
-                    for message in rule["messages"]:
-                        for key in rule["key_exprs"]:
-                            for name in subjects[subject]:
-                                yield flow, message, key, name
+                yield from product(
+                    rule["flows"], rule["messages"], rule["key_exprs"], subjects[subject]
+                )
 
 
 def test_without_tls_rules_are_for_anyone_and_over_tls_each_is_for_one_certificate() -> None:
@@ -109,3 +111,31 @@ def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
 )
 def test_a_token_that_no_adapter_declares_is_not_parsed(launch: str) -> None:
     assert parse_alive_key(f"rack/home/alive/{launch}") is None
+
+
+SNAPSHOTS = Snapshots(__file__)
+TABLES: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "loopback": {"listen": ("tcp/127.0.0.1:7447",), "export": {"a": {"from": "a.status"}}},
+    "beyond": {"listen": ("tcp/10.0.0.1:7447",), "insecure": True, "estop_from": ("x",)},
+    "tls": {
+        "listen": ("tls/10.0.0.1:7447",),
+        "connect": ("tls/friend.example:7447",),
+        "export": {"a": {"from": "a.status"}},
+        "import": {"own": {"from": "friend/pulse.status", **ENTRY}},
+        "peers": ("other",),
+        "estop_from": ("x", "other"),
+        "lease_ms": 300.0,
+    },
+}
+
+
+@pytest.mark.parametrize("is_operator", [False, True])
+@pytest.mark.parametrize("name", TABLES)
+def test_the_session_settings_are_unchanged(name: str, is_operator: bool) -> None:
+    table = LanTable.model_validate(TABLES[name])
+    parts = {
+        "access": build_access_control("home", table, is_operator),
+        "settings": str(_build_settings("home", table, None, is_operator)),
+    }
+    SNAPSHOTS.check(f"{name}{', operator' if is_operator else ''}", parts)

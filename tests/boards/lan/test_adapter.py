@@ -4,7 +4,7 @@ racks."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,8 +18,9 @@ from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.status import build_status_class
 from rack.levels.peer import PeerPresence
 from rack.levels.references import find_class
+from tests.boards.config.mistakes import read_config
 from tests.boards.lan.conftest import EVERY, MakeSegment
-from tests.boards.lan.racks import configs, rack_text
+from tests.boards.lan.racks import rack_text
 
 PERIOD_NS = 2_500_000
 STOP = 'on_peer_loss = "stop"'
@@ -31,7 +32,7 @@ Change = tuple[str, int, bool]
 
 
 @pytest.fixture
-def make(make_segment: MakeSegment, rack_name: str, tmp_path: Path) -> MakeAdapter:
+def make(make_segment: MakeSegment, rack_name: str) -> MakeAdapter:
     """Make the one adapter of a test: what comes and goes is what its list has."""
 
     def make_one(
@@ -39,8 +40,7 @@ def make(make_segment: MakeSegment, rack_name: str, tmp_path: Path) -> MakeAdapt
     ) -> tuple[LanAdapter, Segment]:
         text = rack_text(rack_name, "tcp/127.0.0.1:7447", (), "b", peers=("b",), lan=lan)
         mode = "lockstep" if lockstep else "realtime"
-        (config,) = configs([text], tmp_path, f"clock.mode={mode}")
-        plan = resolve(config)
+        plan = resolve(read_config(text, [f"clock.mode={mode}"]))
         segment = make_segment(plan.layout, lockstep=lockstep)
         (wiring,) = (task for task in plan.tasks if task.task == "lan")
         adapter = find_class(wiring.target, LanAdapter)(wiring.context)
@@ -137,17 +137,14 @@ def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -
     adapter, _ = make([])
     # What is imported needs a link to be counted.
     adapter._imports.clear()
-
-    class Link:
-        sealer = Sealer()
-
-    Link.sealer.flaws = dict.fromkeys(Flaw, 3)
+    sealer = Sealer()
+    sealer.flaws = dict.fromkeys(Flaw, 3)
     out = build_status_class(adapter._table.exports, adapter._table.imports).zeros({})
     adapter.store_output("status", out)
     adapter.store_output("peer_b", PeerPresence.zeros({}))
     adapter._write_status(8)
     assert out.flaws.tolist() == (0,) * len(Flaw)
     assert (out.state, out.reason) == (State.HOLDING, "rack 'b' is not there yet")
-    adapter._link = Link()  # type: ignore[assignment]
+    adapter._link = SimpleNamespace(sealer=sealer)  # type: ignore[assignment]
     adapter._write_status(8)
     assert out.flaws.tolist() == (3,) * len(Flaw)

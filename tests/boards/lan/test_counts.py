@@ -18,11 +18,6 @@ def head(number: int, serial: int = 0) -> Envelope:
     return Envelope(1, 7, serial or 3 * number, number, 0, 0, 0)
 
 
-def tracker() -> tuple[SequenceTracker, LanImport]:
-    count = zero_counts(LanImport)
-    return SequenceTracker(count), count
-
-
 NEW, OLD, AGAIN = "new", "disordered", "repeated"
 
 
@@ -60,7 +55,8 @@ number) and what each counts as; how many are missing."""
 def test_each_message_is_counted_as_what_it_is(
     resumed: tuple[int, ...], messages: list[tuple[int, int, str]], missing: int
 ) -> None:
-    found, count = tracker()
+    count = zero_counts(LanImport)
+    found = SequenceTracker(count)
     if resumed:
         count.launch, count.number = resumed
         count.serial = 3 * count.number
@@ -76,7 +72,8 @@ def test_each_message_is_counted_as_what_it_is(
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
 def test_every_message_counts_as_new_disordered_repeated_or_missing(numbers: list[int]) -> None:
-    found, count = tracker()
+    count = zero_counts(LanImport)
+    found = SequenceTracker(count)
     first = numbers[0]
     came = [number for number in numbers if number >= first]
     new = sum(found.accept_message(head(number, serial=number + 1)) for number in came)

@@ -12,6 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import NameOID
 
 from rack.boards.lan.credentials import Credentials
@@ -65,12 +66,6 @@ def test_a_key_that_others_can_read_is_refused(folder: Path) -> None:
     assert flaws(folder) == ["cell-key.pem: mode 0640 lets others read it; it must be 0600"]
 
 
-def test_a_certificate_is_for_one_rack(folder: Path) -> None:
-    shutil.copy(folder / "puma.pem", folder / "cell.pem")
-    shutil.copy(folder / "puma-key.pem", folder / "cell-key.pem")
-    assert flaws(folder) == ["cell.pem: the certificate is for 'puma' instead of rack 'cell'"]
-
-
 def test_a_certificate_is_for_the_addresses_on_which_the_rack_listens(made: Path) -> None:
     (flaw,) = flaws(made, "cell", "10.0.0.1", "10.0.0.9")
     assert flaw == (
@@ -79,24 +74,25 @@ def test_a_certificate_is_for_the_addresses_on_which_the_rack_listens(made: Path
     )
 
 
-def test_the_key_must_belong_to_the_certificate(folder: Path) -> None:
-    shutil.copy(folder / "puma-key.pem", folder / "cell-key.pem")
-    assert flaws(folder) == ["cell-key.pem: the key does not belong to cell.pem"]
-
-
-def test_a_key_with_a_password_is_refused(folder: Path) -> None:
-    path = folder / "cell-key.pem"
-    key = serialization.load_pem_private_key(path.read_bytes(), None)
-    locked = serialization.BestAvailableEncryption(b"word")
-    form = serialization.PrivateFormat.PKCS8
-    path.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, locked))
-    assert flaws(folder) == ["cell-key.pem: the key is encrypted; it must have no password"]
-
-
-def test_a_certificate_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("copied", "flaw"),
+    [
+        (
+            ("puma.pem", "puma-key.pem"),
+            "cell.pem: the certificate is for 'puma' instead of rack 'cell'",
+        ),
+        (("puma-key.pem",), "cell-key.pem: the key does not belong to cell.pem"),
+        (("authority.pem",), "cell.pem: the certificate is not signed by authority.pem"),
+    ],
+)
+def test_files_that_do_not_belong_together_are_refused(
+    folder: Path, tmp_path: Path, copied: tuple[str, ...], flaw: str
+) -> None:
     make_credentials(tmp_path / "other", NAMES, 2)
-    shutil.copy(tmp_path / "other/authority.pem", folder / "authority.pem")
-    assert flaws(folder) == ["cell.pem: the certificate is not signed by authority.pem"]
+    for name in copied:
+        source = tmp_path / "other" if name == "authority.pem" else folder
+        shutil.copy(source / name, folder / name.replace("puma", "cell"))
+    assert flaws(folder) == [flaw]
 
 
 @pytest.mark.parametrize("name", ["authority.pem", "cell.pem", "cell-key.pem"])
@@ -109,15 +105,33 @@ def test_files_that_are_not_pem_are_refused(folder: Path, name: str, content: by
     assert f"{name}: the file contains no {kind} in PEM form" in flaws(folder)
 
 
-def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
-    for key in (ec.generate_private_key(ec.SECP384R1()), Ed25519PrivateKey.generate()):
-        form = serialization.PrivateFormat.PKCS8
-        none = serialization.NoEncryption()
-        path = folder / "cell-key.pem"
-        path.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, none))
-        assert flaws(folder) == [
-            "cell-key.pem: the key is of another kind; it must be on the curve P-256"
-        ]
+NONE = serialization.NoEncryption()
+OTHER_KIND = "the key is of another kind; it must be on the curve P-256"
+
+
+@pytest.mark.parametrize(
+    ("key", "encryption", "why"),
+    [
+        (
+            ec.generate_private_key(ec.SECP256R1()),
+            serialization.BestAvailableEncryption(b"word"),
+            "the key is encrypted; it must have no password",
+        ),
+        (ec.generate_private_key(ec.SECP384R1()), NONE, OTHER_KIND),
+        (Ed25519PrivateKey.generate(), NONE, OTHER_KIND),
+    ],
+    ids=["password", "another curve", "another algorithm"],
+)
+def test_a_key_with_a_password_or_of_another_kind_is_refused(
+    folder: Path,
+    key: PrivateKeyTypes,
+    encryption: serialization.KeySerializationEncryption,
+    why: str,
+) -> None:
+    form = serialization.PrivateFormat.PKCS8
+    written = key.private_bytes(serialization.Encoding.PEM, form, encryption)
+    (folder / "cell-key.pem").write_bytes(written)
+    assert flaws(folder) == [f"cell-key.pem: {why}"]
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,6 @@ def racks(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[
         yield pair
 
 
-@pytest.mark.slow
 def test_lost_packets_lose_no_message_and_no_rack(lab: Lab, racks: tuple[LabRack, LabRack]) -> None:
     before = [rack.counts() for rack in racks]
     lab.lose(1, LOSS)
@@ -168,7 +167,6 @@ def test_lost_packets_lose_no_message_and_no_rack(lab: Lab, racks: tuple[LabRack
         assert rack.heard()[1] == 0
 
 
-@pytest.mark.slow
 def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_as_new(
     lab: Lab, racks: tuple[LabRack, LabRack]
 ) -> None:
@@ -195,7 +193,6 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
         assert rack.heard()[1] == 0
 
 
-@pytest.mark.slow
 def test_a_killed_rack_is_lost_and_its_next_launch_is_distinguished(
     racks: tuple[LabRack, LabRack],
 ) -> None:

@@ -51,18 +51,12 @@ def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool
         yield changes.pop(0)
 
 
-def restarted(peer: PeerRack, confirm_by: int) -> PeerRack:
-    """Return the rack as a restarted adapter finds it in its mailbox."""
-    message, after = PeerPresence.zeros({}), PeerRack("b")
-    peer.write_presence(message, is_lockstep=False)
-    after.restore_state(message, confirm_by)
-    return after
-
-
 def test_a_restarted_adapter_continues_with_the_same_launch() -> None:
     peer = PeerRack("b")
     peer.add_token(OLD, 5)
-    after = restarted(peer, 100)
+    message, after = PeerPresence.zeros({}), PeerRack("b")
+    peer.write_presence(message, is_lockstep=False)
+    after.restore_state(message, 100)
     assert after.presence is Presence.THERE
     assert (after.launch, after.launches, after.since) == (OLD, 1, 5)
     after.add_token(OLD, 50)

@@ -10,7 +10,7 @@ import pytest
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config import load, resolve_layout
+from rack.boards.config import resolve_layout
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
@@ -20,6 +20,7 @@ from rack.boards.lan.remote_estop import CHECK_FLAG, ESTOP_KIND, EstopResponder
 from rack.levels.level import Finding
 from rack.tools.network.certificates import make_credentials
 from tests.boards.commanded_racks import COMMANDED
+from tests.boards.config.mistakes import read_config
 from tests.boards.lan.conftest import MakeSegment
 
 LAUNCH, SESSION = 77, 5
@@ -96,10 +97,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(make_segment: MakeSegment, rack_name: str, tmp_path: Path) -> Bench:
-    path = tmp_path / "rack.toml"
-    path.write_text(COMMANDED)
-    config = load(path, [f"name={rack_name}", "clock.mode=realtime"])
+def bench(make_segment: MakeSegment, rack_name: str) -> Bench:
+    config = read_config(COMMANDED, [f"name={rack_name}", "clock.mode=realtime"])
     return Bench(make_segment(resolve_layout(config)))
 
 

@@ -23,7 +23,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from itertools import product
 from random import Random
 from typing import Any
 
@@ -63,37 +63,19 @@ ROUND = np.dtype(
 """What the process of a round notes. That of round 0 is this process."""
 
 
-def cripple_lock() -> None:
-    """Let several processes take over at once."""
-    ByteLock.take = lambda self: True  # type: ignore[method-assign]
-
-
-def cripple_claim() -> None:
-    """Let readers accept messages of any writer."""
-    Slots.is_from_claimant = lambda self, known: True  # type: ignore[method-assign]
-
-
-def cripple_checksum() -> None:
-    """Let readers accept messages with any content."""
-    Slots.passes_check = property(lambda self: True)  # type: ignore[assignment]
-
-
 COUNTS = np.dtype([(name, "i8") for name in ("read", "torn", "stale", "missing")])
 LOOK = 20
 """Rounds with a crippled safeguard after which the counts are looked at."""
-ENDS = (
-    (signal.SIGKILL, True),
-    (signal.SIGKILL, False),
-    (signal.SIGSTOP, True),
-    (signal.SIGSTOP, False),
-)
+ENDS = tuple(product((signal.SIGKILL, signal.SIGSTOP), (True, False)))
 """How a process ends a round, and whether the one stopped before continues at once."""
-CRIPPLES: dict[str, tuple[Callable[[], None], str]] = {
-    "lock": (cripple_lock, "double"),
-    "claim": (cripple_claim, "stale"),
-    "checksum": (cripple_checksum, "torn"),
+CRIPPLES: dict[str, tuple[type, str, Any, str]] = {
+    # Several processes may take over at once.
+    "lock": (ByteLock, "take", lambda self: True, "double"),
+    # Readers accept messages of any writer, and with any content.
+    "claim": (Slots, "is_from_claimant", lambda self, known: True, "stale"),
+    "checksum": (Slots, "passes_check", property(lambda self: True), "torn"),
 }
-"""What cripples a safeguard, and what must not happen, and then does."""
+"""A safeguard's class, its name and what cripples it; and what must not happen, and then does."""
 
 
 def build_segment(rack: str) -> Segment:
@@ -363,8 +345,8 @@ class HandOvers:
 def main(rack: str, count: int, cripple: str = "") -> None:
     wrong = ""
     if cripple:
-        break_safeguard, wrong = CRIPPLES[cripple]
-        break_safeguard()
+        owner, name, crippled, wrong = CRIPPLES[cripple]
+        setattr(owner, name, crippled)
     segment = build_segment(rack)
     try:
         hand_overs = HandOvers(segment, count)

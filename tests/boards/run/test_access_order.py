@@ -30,42 +30,31 @@ WORDS = {
 }
 
 
-class RecordedBox:
-    """The head of a mailbox, which notes the accesses to its words."""
+class Recorded:
+    """The head of a mailbox, or a slot: notes the accesses to what `name_of` has a name for."""
 
-    def __init__(self, words: memoryview, accesses: list[str]) -> None:
-        self._words, self._accesses = words, accesses
+    def __init__(
+        self, memory: memoryview, name_of: Callable[[Any], str | None], accesses: list[str]
+    ) -> None:
+        self._memory, self._name_of, self._accesses = memory, name_of, accesses
 
-    def __getitem__(self, at: int) -> int:
+    def __getitem__(self, at: Any) -> Any:
         self._note("load", at)
-        return self._words[at]
+        return self._memory[at]
 
-    def __setitem__(self, at: int, value: int) -> None:
+    def __setitem__(self, at: Any, value: Any) -> None:
         self._note("store", at)
-        self._words[at] = value
+        self._memory[at] = value
 
-    def _note(self, what: str, at: int) -> None:
-        if at in WORDS:
-            self._accesses.append(f"{what} {WORDS[Box.HEAD if at == 0 else at]}")
+    def _note(self, what: str, at: Any) -> None:
+        if name := self._name_of(at):
+            self._accesses.append(f"{what} {name}")
 
 
-class RecordedSlot:
-    """A slot, which notes copies to and from it."""
-
-    def __init__(self, place: memoryview, accesses: list[str]) -> None:
-        self._place, self._accesses = place, accesses
-
-    def __getitem__(self, part: slice) -> memoryview:
-        self._note("load", part)
-        return self._place[part]
-
-    def __setitem__(self, part: slice, content: memoryview) -> None:
-        self._note("store", part)
-        self._place[part] = content
-
-    def _note(self, what: str, part: slice) -> None:
-        name = {(None, SIGNED_FROM): "signature", (SIGNED_FROM, None): "message"}
-        self._accesses.append(f"{what} {name[part.start, part.stop]}")
+def name_part(part: slice) -> str:
+    """Return the name of a part of a slot."""
+    names = {(None, SIGNED_FROM): "signature", (SIGNED_FROM, None): "message"}
+    return names[part.start, part.stop]
 
 
 class RecordedWords:
@@ -92,11 +81,11 @@ def accesses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def opened(slots: Any, *arguments: Any) -> None:
         begin(slots, *arguments)
-        slots.places = [RecordedSlot(place, made) for place in slots.places]
+        slots.places = [Recorded(place, name_part, made) for place in slots.places]
         slots.heads = [RecordedWords(words, made) for words in slots.heads]
 
     monkeypatch.setattr(
-        Segment, "get_box", lambda segment, name: RecordedBox(box_of(segment, name), made)
+        Segment, "get_box", lambda segment, name: Recorded(box_of(segment, name), WORDS.get, made)
     )
     monkeypatch.setattr(Slots, "__init__", opened)
     monkeypatch.setattr(Slots, "fence", staticmethod(lambda: made.append("fence")))
@@ -170,26 +159,17 @@ def changed(function: Any, before: str, after: str) -> Any:
 
 
 FENCE = "self.fence()\n"
+PUBLISHING = (Slots, "publish_message")
+FILL = "self.places[at][SIGNED_FROM:]"
 PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     "head before slot": (
-        Slots,
-        "publish_message",
-        f"{FENCE}    self.places[at][SIGNED_FROM:]",
-        f"{FENCE}    box[0] = serial\n    self.places[at][SIGNED_FROM:]",
+        *PUBLISHING,
+        f"{FENCE}    {FILL}",
+        f"{FENCE}    box[0] = serial\n    {FILL}",
     ),
-    "relaxed store of the head": (
-        Slots,
-        "publish_message",
-        f"{FENCE}    box[0] = serial",
-        "box[0] = serial",
-    ),
-    "no fence before a slot is filled": (
-        Slots,
-        "publish_message",
-        f"{FENCE}    self.places[at][SIGNED_FROM:]",
-        "self.places[at][SIGNED_FROM:]",
-    ),
-    "signature before message": (Slots, "publish_message", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
+    "relaxed store of the head": (*PUBLISHING, f"{FENCE}    box[0] = serial", "box[0] = serial"),
+    "no fence before a slot is filled": (*PUBLISHING, f"{FENCE}    {FILL}", FILL),
+    "signature before message": (*PUBLISHING, "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
     "relaxed load of the head": (Reader, "read", "slots.fence()\n", "pass\n"),
     "signature loaded after the message": (Slots, "load_slot", FENCE, "pass\n"),
     "relaxed load of the claim": (Slots, "load_slot", f"that.\n    {FENCE}", "that.\n"),
@@ -287,7 +267,6 @@ MACHINE_CODE = {"publish": PUBLISH, "read": READ[:-1]}
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_machine_code_makes_the_accesses_of_the_model_in_its_order(
     compile_all: Callable[[], None],
 ) -> None:
@@ -295,11 +274,13 @@ def test_machine_code_makes_the_accesses_of_the_model_in_its_order(
     assert of_machine_code() == MACHINE_CODE
 
 
+COMPILED_FENCE = "    fence()\n"
+COMPILED_FILL = "    copy(slot + SIGNED"
 MACHINE_MUTANTS: dict[str, tuple[str, str, str]] = {
     "head before slot": (
         "publish",
-        "    fence()\n    copy(slot + SIGNED",
-        "    fence()\n    store_release(port.head, before + 1)\n    copy(slot + SIGNED",
+        f"{COMPILED_FENCE}{COMPILED_FILL}",
+        f"{COMPILED_FENCE}    store_release(port.head, before + 1)\n{COMPILED_FILL}",
     ),
     "relaxed store of the head": (
         "publish",
@@ -308,8 +289,8 @@ MACHINE_MUTANTS: dict[str, tuple[str, str, str]] = {
     ),
     "no fence before a slot is filled": (
         "publish",
-        "    fence()\n    copy(slot + SIGNED",
-        "    copy(slot + SIGNED",
+        f"{COMPILED_FENCE}{COMPILED_FILL}",
+        COMPILED_FILL,
     ),
     "signature before message": ("publish", "    fence()\n    copy(slot, ", "    copy(slot, "),
     "relaxed load of the head": ("read_port", "load(port.head)", "slot_at(port.head).stamp"),

@@ -17,6 +17,8 @@ from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, forked
 
+pytestmark = pytest.mark.filterwarnings(FORKS)
+
 
 def raising(error: Exception) -> Callable[[Segment], int]:
     """Return a board that ends with an error."""
@@ -44,7 +46,6 @@ def ended(segment: Segment, board: Callable[[Segment], int]) -> tuple[int, str]:
         return exit_status(pid), printed
 
 
-@pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
@@ -59,7 +60,6 @@ def test_the_exit_status_gives_the_reason_why_a_board_ended(
     assert ended(make_bus(task("level")), raising(error)) == (status, said)
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(make_bus: MakeBus) -> None:
     status, said = ended(make_bus(task("level")), raising(ZeroDivisionError("by zero")))
     assert status == 1
@@ -67,7 +67,6 @@ def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(make_bus: MakeBus)
     assert said.endswith("ZeroDivisionError: by zero\n")
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_board_that_ends_regularly_has_its_exit_status_and_name(make_bus: MakeBus) -> None:
     def board(segment: Segment) -> int:
         os.write(2, Path("/proc/self/comm").read_bytes())

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag, open_trace_ring
 from rack.backplane.watch.alarms import Alarm, open_alarm_ring
-from rack.backplane.words import Block, Slot, System
+from rack.backplane.words import Block, System
 from rack.boards.config import Resolved, resolve
 from rack.boards.faults.kind import KINDS
 from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, MakeSegment
 from tests.processes import FORKS
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -33,9 +33,9 @@ class Bench:
     """A wired rack whose tasks are cycled by the test; the clock stands at tick 0 and a tick lasts
     an hour."""
 
-    def __init__(self, plan: Resolved) -> None:
+    def __init__(self, plan: Resolved, segment: Segment) -> None:
         self.plan = plan
-        self.segment = Segment.create(plan.layout, "")
+        self.segment = segment
         self.segment.words[System.PERIOD_NS] = HOUR_NS
         self.to(0)
 
@@ -53,6 +53,12 @@ class Bench:
             self.segment, wiring, find_class(wiring.target, Executor)(wiring.context)
         )
 
+    def cycle(self, tick: int, *tasks: VirtualControlLoop | PlannerLoop) -> None:
+        """Cycle tasks in the middle of a tick, one after the other."""
+        self.to(tick)
+        for task in tasks:
+            task.cycle(tick)
+
     def flags(self, name: str) -> list[Flag]:
         """Return the trouble in every cycle of a task so far."""
         return [
@@ -62,17 +68,12 @@ class Bench:
 
 
 @pytest.fixture
-def bench(config: MakeConfig) -> Iterator[MakeBench]:
-    made: list[Bench] = []
-
+def bench(config: MakeConfig, make_segment: MakeSegment) -> MakeBench:
     def make(*settings: str) -> Bench:
-        made.append(Bench(resolve(config("clock.mode=realtime", *settings))))
-        return made[-1]
+        plan = resolve(config("clock.mode=realtime", *settings))
+        return Bench(plan, make_segment(plan.layout, ""))
 
-    yield make
-    for found in made:
-        unlink_segment(found.segment.rack)
-        found.segment.close()
+    return make
 
 
 def test_a_slow_level_may_use_its_whole_cycle(bench: MakeBench) -> None:
@@ -93,12 +94,9 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     assert slots.fetch_message(1)
     for place in slots.places:
         place[:] = bytes(b ^ 0x80 for b in place)
-    rack.to(8)
-    watch.cycle(8)
-    rack.to(15)
-    wave.cycle(15)
-    rack.to(16)
-    watch.cycle(16)
+    rack.cycle(8, watch)
+    rack.cycle(15, wave)
+    rack.cycle(16, watch)
     assert rack.flags("watch") == [Flag.CORRUPT, Flag(0)]
     assert rack.segment.get_block("watch")[Block.CORRUPT] == 1
 
@@ -111,26 +109,11 @@ def test_an_access_that_times_out_is_traced_and_the_cycle_continues(bench: MakeB
     # Somebody is in the critical section, and stays.
     holder = MailboxLock(rack.segment, "wave.status")
     assert holder.acquire()
-    rack.to(8)
-    watch.cycle(8)
-    wave.cycle(8)
+    rack.cycle(8, watch, wave)
     assert rack.flags("watch") == [Flag(0), Flag.BUS_ERROR]
     # A failed write is a missed deadline.
     assert rack.flags("wave") == [Flag(0), Flag.BUS_ERROR | Flag.MISSED]
     assert [rack.segment.get_block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
-
-
-def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -> None:
-    rack = bench()
-    wave, watch = rack.task("wave"), rack.task("watch")
-    for tick in range(4):
-        rack.to(tick)
-        wave.cycle(tick)
-    rack.to(8)
-    watch.cycle(8)
-    slots = Slots(rack.segment, rack.segment.layout.find_mailbox("watch.status"))
-    assert slots.fetch_message(1)
-    assert (slots.tick, slots.words[Slot.BASIS]) == (8, 3)
 
 
 def test_the_update_of_a_plan_is_stamped_inside_the_critical_section(
@@ -152,8 +135,7 @@ def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
     rack = bench("board.wave.params.plan_every=4")
     planner = rack.task("wave.planner")
     for tick in (0, 4, 5, 6, 8):
-        rack.to(tick)
-        planner.cycle(tick)
+        rack.cycle(tick, planner)
     rows = open_trace_ring(rack.segment, "wave.planner").read_new_rows().rows
     assert rows["tick"].tolist() == [0, 4, 8]
     assert (rows["flags"] & Flag.PLANNED).all()
@@ -174,26 +156,19 @@ def test_a_release_without_a_plan_is_traced_after_skipped_ones(
     planner.cycle(5)
     assert rack.flags("wave.planner") == [Flag(0), trouble]
     block = rack.segment.get_block("wave.planner")
-    assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)] == [
-        2,
-        1,
-        5,
-        1,
-    ]
+    words = (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)
+    assert [block[word] for word in words] == [2, 1, 5, 1]
 
 
 def test_a_pause_in_reading_is_noted_in_a_cycle_that_begins_late(bench: MakeBench) -> None:
     rack = bench()
     watch = rack.task("watch")
-    rack.to(8)
-    watch.cycle(8)
+    rack.cycle(8, watch)
     assert watch.inputs.task.since == 8
-    rack.to(16)
-    watch.cycle(16)
+    rack.cycle(16, watch)
     assert watch.inputs.task.since == 8
-    rack.to(32)
     watch.next_cycle.skipped = 1
-    watch.cycle(32)
+    rack.cycle(32, watch)
     assert watch.inputs.task.since == 32
 
 
@@ -205,8 +180,7 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     entry = FaultTable(rack.segment).add_fault(Injection(kind.number, at, parameters=(0.0, 0.0)))
     entry.stage = Stage.ACTIVE
     wave.faults.refresh_faults(0)
-    rack.to(0)
-    wave.cycle(0)
+    rack.cycle(0, wave)
     assert entry.count == 1
     assert entry.struck_tick == 0
 
@@ -216,8 +190,7 @@ def test_a_user_defined_finding_raises_one_alarm_per_episode(bench: MakeBench) -
     rack = bench("board.wave.executor=wave_levels:Surf", f"board.wave.params.breaks={breaks}")
     wave = rack.task("wave")
     for tick in range(110):
-        rack.to(tick)
-        wave.cycle(tick)
+        rack.cycle(tick, wave)
     rows = open_alarm_ring(rack.segment, "wave").read_new_rows().rows
     assert set(rows["code"]) == {Alarm.OWN}
     # It begins anew when it was not found for more than 20 cycles.

@@ -13,7 +13,7 @@ from rack.boards import Rack
 from rack.boards.exchange import PortAge
 from rack.tools.monitor.snapshot import RackMonitor
 from tests.boards.config.mistakes import find_lines, find_mistake
-from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.conftest import CLOCK, MakeConfig, format_board
 from tests.boards.messages import Written, run_and_read
 from tests.boards.runs import digest_of, faulty, kill
 
@@ -21,20 +21,14 @@ WAVE, NOTES = (2, 1), (3, 2)
 """Period and phase of the writer and of the reader, ticks."""
 SPARSE = (4, 1)
 """Period and phase of the port that is read now and then, cycles."""
-TEXT = f"""{CLOCK}
-[board.wave]
-slot = 2
-every = {WAVE[0]}
-phase = {WAVE[1]}
-executor = "wave_levels:Wave"
-
-[board.notes]
-slot = 3
-every = {NOTES[0]}
-phase = {NOTES[1]}
-below = "wave"
-executor = "exchange_levels:Notes"
-
+NO_TABLE = (
+    CLOCK
+    + format_board("wave", 2, "wave_levels:Wave", every=WAVE[0], phase=WAVE[1])
+    + format_board(
+        "notes", 3, "recording_levels:Notes", every=NOTES[0], phase=NOTES[1], below="wave"
+    )
+)
+TEXT = f"""{NO_TABLE}
 [board.notes.exchange]
 sparse = {{ every = {SPARSE[0]}, phase = {SPARSE[1]} }}
 early = {{ asynchronous = true }}
@@ -43,26 +37,14 @@ TICKS = 100
 SECONDS = 0.25
 
 
-def newest(tick: int, delay: int) -> int:
-    """Return the release of the wave's newest message that is visible at a tick; negative: none
-    is."""
-    every, phase = WAVE
-    return tick - delay - (tick - delay - phase) % every
-
-
-def ages(rows: np.ndarray, port: str) -> list[tuple[int, int]]:
-    """Return age and tick of arrival of a port, cycle by cycle."""
-    fields = rows["message"]
-    return list(zip(fields[f"{port}_age"].tolist(), fields[f"{port}_taken"].tolist(), strict=True))
-
-
 def model(port: str) -> list[tuple[int, int]]:
     """Return what the record of a port must show in each cycle."""
     (every, phase), found, made, taken = NOTES, [], -1, -1
     for cycle, tick in enumerate(range(phase, TICKS, every)):
         if port != "sparse" or cycle % SPARSE[0] == SPARSE[1]:
-            # The faster board goes first in a tick.
-            seen = newest(tick, 0 if port == "early" else WAVE[0])
+            # The faster board goes first in a tick. What it released last and is visible:
+            visible = tick - (0 if port == "early" else WAVE[0])
+            seen = visible - (visible - WAVE[1]) % WAVE[0]
             if seen > made:
                 made, taken = seen, tick
         found.append((tick - made if made >= 0 else 0, taken))
@@ -79,10 +61,10 @@ def test_ages_and_arrivals_follow_the_configured_exchange_and_runs_repeat(
         looked = RackMonitor(rack.segment).take_snapshot()
     seen, record = found["notes.status"], found["notes.exchange"]
     for at, port in enumerate(("plain", "sparse", "early")):
-        assert ages(record, port) == model(port)
+        age, taken = (record["message"][f"{port}_{name}"] for name in ("age", "taken"))
+        assert list(zip(age.tolist(), taken.tolist(), strict=True)) == model(port)
         # Until the next exchange the level sees the last reading as an old one.
-        taken = record["message"][f"{port}_taken"]
-        made = seen["tick"] - record["message"][f"{port}_age"]
+        made = seen["tick"] - age
         values = np.where(taken < 0, 0.0, 0.5 * made)
         assert seen["message"]["value"][:, at].tolist() == values.tolist()
         verdicts = np.where(
@@ -101,7 +83,6 @@ def test_a_port_that_is_read_rarely_raises_no_alarm(config: MakeConfig) -> None:
         assert [event for event in rack.events if event.kind == "detection"] == []
 
 
-NO_TABLE = TEXT.partition("[board.notes.exchange]")[0]
 QUEUE = (
     "protocol.mailbox={ 'wave.status' = 'queue' }",
     "board.notes.executor='wave_levels:Watch'",
@@ -163,6 +144,6 @@ def test_a_lost_writer_shows_between_two_exchanges(config: MakeConfig) -> None:
 
 
 def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange() -> None:
-    found = find_lines(TEXT, "board.notes.executor='exchange_levels:Exchanging'")
+    found = find_lines(TEXT, "board.notes.executor='recording_levels:Exchanging'")
     why = "board.notes.exchange: the executor itself writes a mailbox of this name; "
     assert found[0].startswith(why)

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 
 import pytest
 
+from tests.boards.run.hand_overs import CRIPPLES
 from tests.conftest import EXHAUSTIVE
 from tests.processes import BOUND_S, run_to_end
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 ROUNDS = 110_000 if EXHAUSTIVE else 330
 MUTANT_ROUNDS = 1500
 LIMIT_S = 4 * 3600.0 if EXHAUSTIVE else 4 * BOUND_S
@@ -30,7 +31,6 @@ def hand_over(rack: str, rounds: int, cripple: str = "") -> Mapping[str, int]:
     return found
 
 
-@pytest.mark.thorough
 @pytest.mark.timeout(LIMIT_S)
 def test_no_hand_over_tears_a_message_or_makes_two_writers(rack_name: str) -> None:
     found = hand_over(rack_name, ROUNDS)
@@ -45,9 +45,7 @@ def test_no_hand_over_tears_a_message_or_makes_two_writers(rack_name: str) -> No
     assert found["read"] > ROUNDS
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("cripple", "wrong"), [("lock", "double"), ("claim", "stale"), ("checksum", "torn")]
-)
-def test_a_missing_safeguard_is_found(rack_name: str, cripple: str, wrong: str) -> None:
+@pytest.mark.parametrize("cripple", CRIPPLES)
+def test_a_missing_safeguard_is_found(rack_name: str, cripple: str) -> None:
+    wrong = CRIPPLES[cripple][-1]
     assert hand_over(rack_name, MUTANT_ROUNDS, cripple)[wrong] > 0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -11,42 +11,24 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import build_rack_timing, resolve_layout
-from rack.boards.faults.config import FaultConfig
 from rack.boards.timing.verdicts import RESPONSE_TIME, evaluate_rack
-from tests.boards.conftest import MakeConfig
-from tests.boards.interrupt_levels import BOARDS
+from tests.boards.conftest import CLOCK, MakeConfig, format_board, format_figure
 from tests.boards.messages import Written
+from tests.boards.recording_levels import BOARDS
+from tests.boards.runs import faulty, kill
 from tests.machine import run_undisturbed
 
 pytestmark = pytest.mark.slow
 
 TICKS, SECONDS = 100, 0.25
-RACK = f"""
-format = 2
-name = "interrupted"
-python_path = ["{Path(__file__).parents[1]}"]
-protocol.default = "interrupt"
-
-[clock]
-period_ms = 2.5
-mode = "lockstep"
-
-[board.hub]
-slot = 2
-every = 1
-below = [{", ".join(f'"figure{at}"' for at in range(BOARDS))}]
-executor = "interrupt_levels:Hub"
-""" + "".join(
-    f"""
-[board.figure{at}]
-slot = {10 - at}
-core = {1 + at}
-every = 1
-executor = "rack.levels.systems.figures:FigureLoop"
-params.process_ms = 0.0
-budget.process_ms = 0.5
-"""
-    for at in range(BOARDS)
+HEAD = f'{CLOCK}\n[protocol]\ndefault = "interrupt"\n'
+FIGURES = [f"figure{at}" for at in range(BOARDS)]
+RACK = (
+    HEAD
+    + format_board("hub", 2, "recording_levels:Hub", every=1, below=FIGURES)
+    + "".join(
+        format_figure(name, 10 - at, 0.5, core=1 + at, every=1) for at, name in enumerate(FIGURES)
+    )
 )
 SMALL = "protocol.interrupt.depth=2"
 """An inbox for three of five messages at once: one is served, two wait."""
@@ -59,14 +41,17 @@ class Heard(NamedTuple):
     its counts.
 
     `counts` are interrupts served and lost, and the most that waited; `full` the events of a full
-    inbox.
+    inbox. `done` are the cycles of the hub, and its releases missed and skipped; `late` the codes
+    of the events about them.
     """
 
     digest: str
     cycle: np.ndarray
     lost: np.ndarray
-    counts: tuple[int, int, int]
+    counts: tuple[int, ...]
     full: list[str]
+    done: tuple[int, ...]
+    late: list[str]
     service_ns: int
     written: Written
 
@@ -74,24 +59,27 @@ class Heard(NamedTuple):
 def run(
     config: MakeConfig,
     *settings: str,
-    faults: tuple[FaultConfig, ...] = (),
+    faults: Iterable[Mapping[str, Any]] = (),
     seconds: float = SECONDS,
 ) -> Heard:
-    with Rack(config(*settings, text=RACK).model_copy(update={"fault": faults})) as rack:
+    with Rack(faulty(config(*settings, text=RACK), *faults)) as rack:
         outcome = rack.run(seconds)
         written, block = Written.on(rack.segment), rack.segment.get_block("hub")
         heard = written.messages["hub.status"]["message"]
-        counts = (
-            block[Block.INTERRUPTS],
-            block[Block.INTERRUPTS_LOST],
-            block[Block.INTERRUPTS_WAITING],
-        )
-        full = [event.text for event in rack.events if event.code == "inbox_full"]
+        served = (Block.INTERRUPTS, Block.INTERRUPTS_LOST, Block.INTERRUPTS_WAITING)
         interrupt = rack.segment.layout.find_mailbox("figure0.status").interrupt
         assert interrupt is not None
-    return Heard(
-        outcome.digest, heard["cycle"], heard["lost"], counts, full, interrupt.service_ns, written
-    )
+        return Heard(
+            digest=outcome.digest,
+            cycle=heard["cycle"],
+            lost=heard["lost"],
+            counts=tuple(block[word] for word in served),
+            full=[event.text for event in rack.events if event.code == "inbox_full"],
+            done=tuple(block[word] for word in (Block.CYCLES, Block.MISSED, Block.SKIPPED)),
+            late=[event.code for event in rack.events if event.code in ("late", "starved")],
+            service_ns=interrupt.service_ns,
+            written=written,
+        )
 
 
 def test_every_message_arrives_in_an_inbox_with_room(config: MakeConfig) -> None:
@@ -131,10 +119,7 @@ def test_an_overloaded_handler_delays_what_it_does_not_lose(config: MakeConfig) 
 def test_runs_with_a_full_inbox_and_killed_boards_repeat(
     config: MakeConfig, settings: tuple[str, ...]
 ) -> None:
-    faults = tuple(
-        FaultConfig(kind="kill", board=board, tick=tick)
-        for board, tick in (("figure4", 20), ("hub", 31))
-    )
+    faults = (kill("figure4", 20), kill("hub", 31))
     quick = "supervision.lockstep_restart_s=0.02"
     first, second = (run(config, quick, *settings, faults=faults) for _ in range(2))
     assert first.digest == second.digest
@@ -143,16 +128,11 @@ def test_runs_with_a_full_inbox_and_killed_boards_repeat(
 
 
 def test_faulty_messages_take_the_same_service_time_in_every_run(config: MakeConfig) -> None:
-    faults = tuple(
-        FaultConfig(kind=kind, board="figure3", tick=tick, cycles=10)  # type: ignore[arg-type]
-        for kind, tick in (
-            ("drop", 10),
-            ("delay", 25),
-            ("corrupt", 40),
-            ("reorder", 55),
-            ("babble", 70),
-        )
-    )
+    begins = {"drop": 10, "delay": 25, "corrupt": 40, "reorder": 55, "babble": 70}
+    faults = [
+        {"kind": kind, "board": "figure3", "tick": tick, "cycles": 10}
+        for kind, tick in begins.items()
+    ]
     first, second = (run(config, faults=faults) for _ in range(2))
     assert first.digest == second.digest
     assert first.counts == second.counts
@@ -173,25 +153,6 @@ FIRST = (
 """Settings with which ordinary processes do not delay boards, where real time is permitted."""
 
 
-class Cycles(NamedTuple):
-    """What a run of the hub has done: missed and skipped releases, and its late events."""
-
-    digest: str
-    cycles: int
-    missed: int
-    skipped: int
-    late: tuple[str, ...]
-
-
-def cycle(config: MakeConfig, *settings: str) -> Cycles:
-    with Rack(config(*settings, text=RACK)) as rack:
-        outcome = rack.run(SECONDS)
-        block = rack.segment.get_block("hub")
-        late = tuple(event.code for event in rack.events if event.code in ("late", "starved"))
-        counts = (block[word] for word in (Block.CYCLES, Block.MISSED, Block.SKIPPED))
-        return Cycles(outcome.digest, *counts, late)
-
-
 @pytest.mark.parametrize(
     ("settings", "is_late"),
     [((), False), ((BUDGET,), False), ((LONG,), False), ((BUDGET, LONG), True)],
@@ -199,26 +160,26 @@ def cycle(config: MakeConfig, *settings: str) -> Cycles:
 def test_handlers_take_their_time_from_the_computation_as_predicted(
     config: MakeConfig, settings: tuple[str, ...], is_late: bool
 ) -> None:
-    first = cycle(config, *settings)
+    first = run(config, *settings)
     rack = config(*settings, text=RACK)
-    found = evaluate_rack(build_rack_timing(rack, resolve_layout(rack)))
+    timing = build_rack_timing(rack, resolve_layout(rack))
+    found = evaluate_rack(timing)
     preempted = [v for v in found if (v.equation, v.subject) == (RESPONSE_TIME, "hub")]
     assert [verdict.holds for verdict in preempted] == [not is_late] * (BUDGET in settings)
-    assert bool(first.missed) == is_late
-    assert first.cycles + first.skipped in (TICKS, TICKS - is_late)
+    cycles, missed, skipped = first.done
+    assert bool(missed) == is_late
+    assert cycles + skipped in (TICKS, TICKS - is_late)
     if is_late:
-        assert cycle(config, *settings) == first
-        interrupt = resolve_layout(rack).find_mailbox("figure0.status").interrupt
-        assert interrupt is not None
+        again = run(config, *settings)
+        assert (again.digest, again.done, again.late) == (first.digest, first.done, first.late)
         # The messages of the next tick come before the computation ends.
-        handlers_ns = BOARDS * interrupt.service_ns
-        timing = build_rack_timing(rack, resolve_layout(rack))
+        handlers_ns = BOARDS * first.service_ns
         switches_ns = 2 * timing.context_switch_ns
         assert preempted[0].left == 1.5e6 + switches_ns + 2 * handlers_ns
         # What the handlers leave of each tick suffices for a part of a computation.
         part = (2.5e6 - handlers_ns) / 1.5e6
-        assert first.missed == first.cycles == pytest.approx(part * TICKS, abs=2)
-        assert first.late == ("late",)
+        assert missed == cycles == pytest.approx(part * TICKS, abs=2)
+        assert first.late == ["late"]
 
 
 def test_a_message_that_comes_between_computations_takes_no_time(config: MakeConfig) -> None:
@@ -263,48 +224,17 @@ def test_in_real_time_interrupts_take_the_time_of_the_computation(config: MakeCo
     assert written - 3 * BOARDS <= served + lost <= written
 
 
-SHARED = f"""
-format = 2
-name = "shared"
-python_path = ["{Path(__file__).parents[1]}"]
-protocol.default = "interrupt"
-
-[clock]
-period_ms = 2.5
-mode = "lockstep"
-scheduler = "fixed-priority"
-
-[timing]
-lockstep_load = 1.0
-
-[board.hub]
-slot = 2
-every = 1
-below = ["quick", "slow"]
-executor = "interrupt_levels:Hub"
-budget.process_ms = 0.5
-
-[board.quick]
-slot = 3
-core = 1
-every = 1
-priority = 80
-executor = "rack.levels.systems.figures:FigureLoop"
-params.process_ms = 0.0
-budget.process_ms = 1.2
-
-[board.slow]
-slot = 4
-core = 1
-every = 4
-priority = 70
-executor = "rack.levels.systems.figures:FigureLoop"
-params.process_ms = 0.0
-budget.process_ms = 1.6
-"""
+HUB = {"every": 1, "below": ["quick", "slow"], "budget": {"process_ms": 0.5}}
+SHARED = (
+    HEAD
+    + format_board("hub", 2, "recording_levels:Hub", **HUB)
+    + format_figure("quick", 3, 1.2, core=1, every=1, priority=80)
+    + format_figure("slow", 4, 1.6, core=1, every=4, priority=70)
+)
 """The computing of 'slow' ends 4 ms after its release, in the second tick of its cycle of four."""
 
 
+LOADED = ("clock.scheduler=fixed-priority", "timing.lockstep_load=1.0")
 EXACT = "timing.context_switch_ms=0"
 """As in lockstep, where context switches take no time."""
 
@@ -323,7 +253,7 @@ EXACT = "timing.context_switch_ms=0"
 def test_a_message_is_sent_after_the_response_of_its_writer(
     config: MakeConfig, settings: tuple[str, ...], due: int, is_late: bool
 ) -> None:
-    rack = config(*settings, text=SHARED)
+    rack = config(*LOADED, *settings, text=SHARED)
     layout = resolve_layout(rack)
     assert layout.compute_due_ticks(layout.find_task("slow")) == due
     found = evaluate_rack(build_rack_timing(rack, layout))

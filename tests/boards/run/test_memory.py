@@ -26,12 +26,6 @@ STRAY = 2
 PRIORITIES = ("clock.priority=90", "board.wave.priority=80", "board.watch.priority=70")
 
 
-def faults_of(pid: int) -> int:
-    """Return the page faults of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return int(fields[7]) + int(fields[9])
-
-
 @pytest.mark.thorough
 @needs_fifo
 def test_no_page_fault_comes_in_a_cycle_after_the_first_ones(config: MakeConfig) -> None:
@@ -45,7 +39,10 @@ def test_no_page_fault_comes_in_a_cycle_after_the_first_ones(config: MakeConfig)
         before: int | None = None
         while len(found) < PARTS:
             watch_until(rack, lambda until=until: words[System.TICK] >= until)  # type: ignore[misc]
-            until, now = words[System.TICK] + PART, faults_of(pid)
+            until = words[System.TICK] + PART
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            # Minor and major page faults so far.
+            now = int(fields[7]) + int(fields[9])
             rows, lost = ring.read_new_rows()
             lost_cycles = rows["flags"] & (Flag.MISSED | Flag.SKIPPED)
             late_ns = (rows["start_ns"] - rows["release_ns"]).max(initial=0)

@@ -12,20 +12,10 @@ from rack.boards import Rack
 from rack.boards.config import resolve_layout
 from rack.boards.config.timing import build_rack_timing
 from rack.boards.timing.schedule import simulate_schedule
-from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.conftest import CLOCK, MakeConfig, format_board
 from tests.boards.messages import Written, run_and_read
 from tests.boards.runs import faulty, kill, run_until
 
-BOARD = """
-[board.{name}]
-slot = {slot}
-core = 0
-every = {every}
-phase = {phase}
-executor = "wave_levels:{kind}"
-{below}
-budget = {{ process_ms = {process_ms} }}
-"""
 MINOR = {"wave": (2, 0, 1.5), "left": (4, 1, 2.2), "right": (4, 3, 2.2)}
 """A minor cycle of two ticks of 2.5 ms: the wave in the first, the watches in the second in
 turn."""
@@ -34,14 +24,15 @@ turn."""
 def cyclic(phases: bool = True) -> str:
     """Return a static cyclic schedule of three boards on one core."""
     boards = [
-        BOARD.format(
-            name=name,
-            slot=2 + at,
+        format_board(
+            name,
+            2 + at,
+            "wave_levels:Watch" if at else "wave_levels:Wave",
+            core=0,
             every=every,
             phase=phase * phases,
-            kind="Watch" if at else "Wave",
-            below=f'below = "{list(MINOR)[at - 1]}"' if at else "",
-            process_ms=process_ms,
+            below=list(MINOR)[:at][-1:],
+            budget={"process_ms": process_ms},
         )
         for at, (name, (every, phase, process_ms)) in enumerate(MINOR.items())
     ]
@@ -49,7 +40,6 @@ def cyclic(phases: bool = True) -> str:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConfig) -> None:
     first, again = Rack(config(text=cyclic())), Rack(config(text=cyclic()))
     found = run_and_read(first, 0.25)
@@ -103,7 +93,6 @@ def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime", text=cyclic())) as rack:
         rack.start()

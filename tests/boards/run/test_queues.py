@@ -121,6 +121,11 @@ class QueueLink:
         unlink_segment(self.segment.rack)
 
 
+def create_segment(rack: str, capacity: int, rates: tuple[int, int]) -> Segment:
+    tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
+    return Segment.create(layout(rack, queue(capacity, rates), tasks), "")
+
+
 MakeQueue = Callable[..., QueueLink]
 
 
@@ -129,9 +134,7 @@ def link(rack_name: str) -> Iterator[MakeQueue]:
     made: list[QueueLink] = []
 
     def make(capacity: int = 8, rates: tuple[int, int] = (1, 1), sends: bool = True) -> QueueLink:
-        tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
-        name = f"{rack_name}-{len(made)}"
-        segment = Segment.create(layout(name, queue(capacity, rates), tasks), "")
+        segment = create_segment(f"{rack_name}-{len(made)}", capacity, rates)
         made.append(QueueLink(segment, sends))
         return made[-1]
 
@@ -152,11 +155,7 @@ def test_order_and_fullness_depend_on_ticks_alone(
 ) -> None:
     runs = []
     for reader_first in (False, True):
-        tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
-        segment = Segment.create(
-            layout(f"test-queue-{id(bursts)}", queue(capacity, rates), tasks), ""
-        )
-        rack = QueueLink(segment)
+        rack = QueueLink(create_segment(f"test-queue-{id(bursts)}", capacity, rates))
         try:
             most = 0
             for tick in range(80):
@@ -237,28 +236,19 @@ def test_an_undetectable_fault_is_not_applied_to_a_queue(link: MakeQueue, kind: 
     assert (rack.taken, entry.count) == ([*range(1, 8)], 0)
 
 
-def forge(rack: QueueLink, tick: int) -> None:
-    assert exit_status(fork(lambda: messages.forge_message(rack.segment, NAME, tick))) == 0
-
-
-def test_a_forged_message_is_not_read_and_displaces_no_message(link: MakeQueue) -> None:
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_a_forged_message_is_not_read_and_displaces_no_message_nor_a_new_writer(
+    link: MakeQueue, is_restarted: bool
+) -> None:
     rack = link()
     rack.run(0, 4, lambda tick: 1)
-    forge(rack, 4)
+    forging = fork(lambda: messages.forge_message(rack.segment, NAME, 4))
+    assert exit_status(forging) == 0
     rack.read(4)
     assert rack.alarms("reader") == [Alarm.MASQUERADE]
+    if is_restarted:
+        rack.restart_writer()
     rack.run(5, 8, lambda tick: 1)
     rack.run(8, 10, lambda tick: 0)
     assert rack.taken == [*range(1, rack.serial + 1)]
-    assert rack.alarms("writer") == [Alarm.MASQUERADE]
-
-
-def test_forged_messages_do_not_hold_up_a_new_writer(link: MakeQueue) -> None:
-    rack = link()
-    rack.run(0, 4, lambda tick: 1)
-    forge(rack, 4)
-    rack.read(4)
-    rack.restart_writer()
-    rack.run(5, 8, lambda tick: 1)
-    rack.run(8, 10, lambda tick: 0)
-    assert rack.taken == [*range(1, rack.serial + 1)]
+    assert rack.alarms("writer") == [Alarm.MASQUERADE] * (not is_restarted)

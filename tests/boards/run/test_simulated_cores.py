@@ -11,9 +11,12 @@ from rack.boards.config import build_rack_timing, resolve
 from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.trace_times import compute_response_ns
 from tests.boards.config.mistakes import find_mistake
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import MakeConfig, format_figure
 
-RACK = """
+
+def format_rack(switch_ms: float, clock_ms: float, *boards: str) -> str:
+    """Return a rack of boards that share a simulated core, and the times that are not theirs."""
+    return f"""
 format = 2
 name = "shared-core"
 
@@ -25,9 +28,13 @@ scheduler = "fixed-priority"
 
 [timing]
 lockstep_load = 1.0
-context_switch_ms = 0.05
-clock_ms = 0.1
+context_switch_ms = {switch_ms}
+clock_ms = {clock_ms}
 
+{"".join(boards)}"""
+
+
+LEVEL = """
 [board.level]
 slot = 2
 every = 4
@@ -39,47 +46,16 @@ priority = 80
 planner_priority = 40
 params = { process_ms = 0.0, plan_ms = 0.0 }
 budget = { process_ms = 0.9, plan_ms = 3.0, update_ms = 0.4 }
-
-[board.beside]
-slot = 3
-every = 6
-executor = "rack.levels.systems.figures:FigureLoop"
-priority = 60
-params = { process_ms = 0.0 }
-budget = { process_ms = 1.4 }
 """
+RACK = format_rack(0.05, 0.1, LEVEL, format_figure("beside", 3, 1.4, every=6, priority=60))
 """With the clock and all context switches, the tasks need 0.992 of the core."""
 
-EQUALS = """
-format = 2
-name = "equals"
-
-[clock]
-period_ms = 1.0
-mode = "lockstep"
-scheduler = "fixed-priority"
-
-[timing]
-lockstep_load = 1.0
-context_switch_ms = 0.0
-clock_ms = 0.0
-
-[board.one]
-slot = 2
-every = 4
-executor = "rack.levels.systems.figures:FigureLoop"
-priority = 60
-params = { process_ms = 0.0 }
-budget = { process_ms = 2.5 }
-
-[board.two]
-slot = 3
-every = 4
-executor = "rack.levels.systems.figures:FigureLoop"
-priority = 60
-params = { process_ms = 0.0 }
-budget = { process_ms = 2.5 }
-"""
+EQUALS = format_rack(
+    0.0,
+    0.0,
+    format_figure("one", 2, 2.5, every=4, priority=60),
+    format_figure("two", 3, 2.5, every=4, priority=60),
+)
 """Two tasks of equal priority that need 1.25 of their core."""
 COUNT = 4
 """Cycles of each task until both wait for the core at a release."""
@@ -92,6 +68,7 @@ LOOSE = ("board.level.coupling=loose", "board.level.planner_slot=4", "board.leve
 
 
 PLANNER = "level.planner"
+LONG_PLAN = (*ORDINARY, "board.level.budget.plan_ms=11", "board.level.within_cycles=9")
 ABOVE = ("board.level.planner_priority=70", "board.level.budget.plan_ms=1.2")
 SETS = {
     "tight": ((), ()),
@@ -106,19 +83,8 @@ SETS = {
     "planner above a board": (ABOVE, ("beside",)),
     "room for that board": ((*ABOVE, "board.beside.every=12"), ()),
     "turns": ((*ORDINARY, "board.beside.every=12"), ()),
-    "turns of a long plan": (
-        (*ORDINARY, "board.level.budget.plan_ms=11", "board.level.within_cycles=9"),
-        ("beside", PLANNER),
-    ),
-    "turns of a long plan with room": (
-        (
-            *ORDINARY,
-            "board.level.budget.plan_ms=11",
-            "board.level.within_cycles=9",
-            "board.beside.every=18",
-        ),
-        (),
-    ),
+    "turns of a long plan": (LONG_PLAN, ("beside", PLANNER)),
+    "turns of a long plan with room": ((*LONG_PLAN, "board.beside.every=18"), ()),
     "deadlines": ((*LOOSE, EARLIEST), ()),
     "deadlines above a planner": (
         (*LOOSE, EARLIEST, "board.beside.budget.process_ms=1.6"),

@@ -20,7 +20,7 @@ from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import SnapshotPolicy
 from tests.backplane.bus import task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 
 PART = 20
 MOST_COST = 0.03
@@ -45,7 +45,7 @@ class StubCopier:
 
 
 @pytest.fixture
-def segment(make_bus: MakeBus) -> Segment:  # noqa: F811
+def segment(make_bus: MakeBus) -> Segment:
     return make_bus(task("level"))
 
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.segment import Segment
 from rack.backplane.standby import ReplicatedTask, list_standbys
 from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
+from tests.boards.config.mistakes import read_config
 from tests.boards.conftest import PLAIN, PLANNED, UNJUDGED, MakeConfig
 from tests.boards.runs import digest_of, end_of, faulty, kill
 from tests.processes import wait_until
@@ -29,6 +29,7 @@ STANDBY = "board.wave.standby={slot=9,core=0}"
 TWO = "board.wave.standby=[{slot=9,core=0},{slot=10,core=1}]"
 SOON = "supervision.lockstep_restart_s=0.05"
 MANY = "supervision.restarts=1000"
+SLOW = ("clock.mode=realtime", "clock.speed=0.01", UNJUDGED, MANY)
 SECONDS = 0.5
 AFTER = 3
 """Ticks after a hand-over in which messages are counted."""
@@ -36,60 +37,36 @@ MISSING = 1
 """Number of messages that a reader may miss in a hand-over in real time."""
 
 
-def hang(board: str, tick: int) -> dict[str, Any]:
-    return {"kind": "hang", "board": board, "tick": tick}
-
-
-def overload(board: str, tick: int) -> dict[str, Any]:
-    """Return a fault that makes cycles take 1.5 times their period."""
-    return {"kind": "overrun", "board": board, "tick": tick, "cycles": 3, "by": 1.5}
-
-
 def run(config: RackConfig) -> tuple[str, ReplicatedTask, list[str]]:
     """Run a rack in lockstep. Returns its digest, its replicated task, and its alarms' codes."""
     with Rack(config) as rack:
         outcome = rack.run(SECONDS)
         (task,) = list_standbys(rack.segment)
+        pids = [rack.segment.get_block(copy.name)[Block.PID] for copy in task.copies]
+        assert [copy.pid for copy in task.copies] == pids
         found = [event.code for event in rack.events if event.kind == "detection"]
     return outcome.digest, task, found
 
 
-def read_ticks(segment: Segment, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the release ticks and the epochs of all messages that readers accept."""
-    rows = MailboxRing(segment, name).read_new_rows().rows
-    return rows["tick"], rows["epoch"] & 0xFFFFFFFF
-
-
+KILLED = kill("wave", 30)
+HANG = {"kind": "hang", "board": "wave", "tick": 30}
+OVERLOAD = {"kind": "overrun", "board": "wave", "tick": 30, "cycles": 3, "by": 1.5}
 CASES: Mapping[str, tuple[str, tuple[Mapping[str, Any], ...], str, str, int]] = {
     "none": (STANDBY, (), "wave", "none", 0),
-    "killed": (STANDBY, (kill("wave", 30),), "wave.standby", "lost", 1),
+    "killed": (STANDBY, (KILLED,), "wave.standby", "lost", 1),
     "killed standby": (STANDBY, (kill("wave.standby", 30),), "wave", "none", 0),
-    "killed twice": (
-        STANDBY,
-        (kill("wave", 30), kill("wave.standby", 80)),
-        "wave",
-        "lost",
-        2,
-    ),
-    "hanging": (STANDBY, (hang("wave", 30),), "wave.standby", "stopped", 1),
-    "late": (STANDBY, (overload("wave", 30),), "wave.standby", "late", 1),
-    "two of three killed": (
-        TWO,
-        (kill("wave", 30), kill("wave.standby", 32)),
-        "wave.standby2",
-        "lost",
-        2,
-    ),
+    "killed twice": (STANDBY, (KILLED, kill("wave.standby", 80)), "wave", "lost", 2),
+    "hanging": (STANDBY, (HANG,), "wave.standby", "stopped", 1),
+    "late": (STANDBY, (OVERLOAD,), "wave.standby", "late", 1),
+    "two of three killed": (TWO, (KILLED, kill("wave.standby", 32)), "wave.standby2", "lost", 2),
 }
 """Standbys, faults, then the active copy at the end, the last reason and number of hand-overs."""
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+def plain() -> str:
     """Digest of the rack without standbys and faults."""
-    path = tmp_path_factory.mktemp("plain") / "waves.toml"
-    path.write_text(PLANNED)
-    return digest_of(load(str(path), [f"name=test-plain-{os.getpid()}"]), SECONDS)
+    return digest_of(read_config(PLANNED, [f"name=test-plain-{os.getpid()}"]), SECONDS)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -131,13 +108,11 @@ def test_a_kill_from_outside_at_any_moment_leaves_the_digest(
 
 @pytest.mark.thorough
 @pytest.mark.alone
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill", "stop"])
 def test_in_real_time_readers_miss_at_most_one_message(
     config: MakeConfig, number: signal.Signals
 ) -> None:
-    slow = ("clock.mode=realtime", "clock.speed=0.01", UNJUDGED, MANY)
-    with Rack(config(STANDBY, *slow, text=PLANNED)) as rack:
+    with Rack(config(STANDBY, *SLOW, text=PLANNED)) as rack:
         words = rack.segment.words
         rack.start(0.05)
         wait_until(lambda: not rack.watch(0.0) or words[System.TICK] >= 5)
@@ -155,7 +130,8 @@ def test_in_real_time_readers_miss_at_most_one_message(
             os.kill(before.active.pid, signal.SIGCONT)
         words[System.STOP_TICK] = max(words[System.TICK] + 1, after.since_tick + AFTER)
         end_of(rack)
-        ticks, epochs = read_ticks(rack.segment, "wave.status")
+        rows = MailboxRing(rack.segment, "wave.status").read_new_rows().rows
+    ticks, epochs = rows["tick"], rows["epoch"] & 0xFFFFFFFF
     assert after.active.name != before.active.name
     assert after.reason in ("lost", "stopped", "late")
     assert np.diff(ticks).min() >= 1
@@ -163,14 +139,6 @@ def test_in_real_time_readers_miss_at_most_one_message(
     assert np.diff(ticks[around]).max() <= 1 + MISSING
     assert (np.diff(epochs) >= 0).all()
     assert epochs[-1] > epochs[0]
-
-
-def test_the_words_of_a_copy_are_those_of_its_process(config: MakeConfig) -> None:
-    with Rack(config(STANDBY)) as rack:
-        (task,) = list_standbys(rack.segment)
-        pids = [rack.segment.get_block(copy.name)[Block.PID] for copy in task.copies]
-    assert [copy.pid for copy in task.copies] == pids
-    assert [(copy.name, copy.slot) for copy in task.copies] == [("wave", 2), ("wave.standby", 9)]
 
 
 CLOCK = "clock.standby={slot=9,core=0}"
@@ -203,10 +171,8 @@ def test_the_standby_of_the_clock_gives_every_tick_once(
 
 @pytest.mark.thorough
 @pytest.mark.alone
-@pytest.mark.slow
 def test_in_real_time_the_standby_of_the_clock_continues_its_grid(config: MakeConfig) -> None:
-    slow = ("clock.mode=realtime", "clock.speed=0.01", UNJUDGED, MANY)
-    with Rack(config(CLOCK, *slow, text=PLANNED)) as rack:
+    with Rack(config(CLOCK, *SLOW, text=PLANNED)) as rack:
         words = rack.segment.words
         rack.start(0.0325)
         wait_until(lambda: not rack.watch(0.0) or words[System.TICK] >= 5)
@@ -242,6 +208,7 @@ def test_an_operator_switches_without_a_gap(config: MakeConfig, plain: str) -> N
     digest, task, alarms = run(config(STANDBY, commands, text=PLANNED))
     assert (task.active.name, task.reason, task.since_tick) == ("wave", "commanded", 90)
     assert task.hand_overs == 2
+    assert [(copy.name, copy.slot) for copy in task.copies] == [("wave", 2), ("wave.standby", 9)]
     assert (digest, alarms) == (plain, [])
 
 
@@ -253,3 +220,40 @@ def test_a_switch_while_no_standby_is_ready_is_reported(config: MakeConfig) -> N
         (event,) = [event for event in rack.events if event.code == "not_switched"]
     assert (event.tick, event.board, event.kind) == (35, "wave", "command")
     assert event.text == "'wave' remains active: no standby has its state"
+
+
+ARM_S = 6.75
+"""The first path is planned, and part of it driven."""
+ARM_STANDBY = ("board.servo.standby={slot=9,core=0}", "board.servo.compare=true")
+FIRST, SECOND = 2300, 2600
+ARM_FAULTS: Mapping[str, tuple[Mapping[str, Any], ...]] = {
+    "no fault": (),
+    "two kills": (kill("servo", FIRST), kill("servo.standby", SECOND)),
+    "a hang": ({"kind": "hang", "board": "servo", "tick": FIRST},),
+}
+
+
+@pytest.fixture(scope="module")
+def plain_arm() -> str:
+    return digest_of(load("nasrem", ["clock.mode=lockstep", "name=test-plain-arm"]), ARM_S)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", ARM_FAULTS)
+def test_the_standby_of_a_servo_level_moves_the_arm_as_if_nothing_had_happened(
+    case: str, rack_name: str, plain_arm: str
+) -> None:
+    config = load("nasrem", ["clock.mode=lockstep", f"name={rack_name}", *ARM_STANDBY])
+    with Rack(faulty(config, *ARM_FAULTS[case])) as rack:
+        digest = rack.run(ARM_S).digest
+        states = MailboxRing(rack.segment, "servo.state").read_new_rows().rows
+        events = rack.events
+    assert digest == plain_arm
+    assert not [event for event in events if event.code in ("brakes_closed", "demand", "differs")]
+    assert states["tick"][0] < FIRST
+    assert (np.diff(states["tick"]) == 1).all()
+    assert not states["message"]["braked"].any()
+    # The arm moves in both hand-overs.
+    speed = np.abs(states["message"]["velocity"]).max(axis=1)
+    for tick in (FIRST, SECOND):
+        assert speed[states["tick"] == tick] > 0.01

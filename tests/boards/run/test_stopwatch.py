@@ -18,7 +18,7 @@ from rack.boards.run.stopwatch import BUS_COUNT_CYCLES, Stopwatch
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.bare_level import BareLevel
-from tests.boards.test_events import box
+from tests.tools.faults.test_ending import box
 
 PERIOD_NS = 2_500_000
 
@@ -64,9 +64,8 @@ class Site:
 
 @pytest.fixture
 def site(make_bus: MakeBus) -> Site:
-    segment = make_bus(
-        task("level"), task("writer"), mailbox(), box("level.status", LevelStatus, "level")
-    )
+    status = box(LevelStatus, "level.status")
+    segment = make_bus(task("level"), task("writer"), mailbox(), status)
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = time.monotonic_ns()
     return Site(segment)

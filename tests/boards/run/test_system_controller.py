@@ -219,22 +219,6 @@ def test_the_next_work_tick_is_the_end_of_the_run_unless_there_is_work(make_bus:
     assert rack.controller.find_next_work_tick(5) == 9
 
 
-def ends_at(
-    segment: Segment, state: State, written: int, until: int, **changed: object
-) -> list[int | None]:
-    """Return when the run ends, as known at each tick, after one status of the level that ends
-    it."""
-    over = EndOfRun(segment, wiring(ends_run="task.status", **changed))
-    found = []
-    for tick in range(until):
-        if tick == written:
-            writer = open_writer(segment, "task.status")
-            writer.message.state = state
-            writer.write(tick)
-        found.append(over(tick))
-    return found
-
-
 ENDS: dict[str, tuple[State, dict[str, int], list[int | None]]] = {
     # Visible at 6, seen at 7 as of the tick before; ten ticks of rest.
     "lingers after its task is done": (State.DONE, {}, [None] * 7 + [16] * 5),
@@ -245,7 +229,8 @@ ENDS: dict[str, tuple[State, dict[str, int], list[int | None]]] = {
     "ends after its longest time": (State.EXECUTING, {"longest": 20}, [None] * 20 + [29] * 15),
     "ends at its given length": (State.DONE, {"stop_tick": 99}, [99] * 12),
 }
-"""What a run does: the state that its task writes, settings, and the end as known at each tick."""
+"""What a run does: the state that its task writes at tick 5, settings, and the end as known at each
+tick."""
 
 
 @pytest.mark.parametrize(("state", "settings", "ends"), ENDS.values(), ids=ENDS)
@@ -253,4 +238,12 @@ def test_a_run_ends_by_its_length_its_task_its_silence_or_its_longest_time(
     make_bus: MakeBus, state: State, settings: dict[str, int], ends: list[int | None]
 ) -> None:
     segment = make_bus(box(TaskStatus, "task.status"), task("task"))
-    assert ends_at(segment, state, 5, len(ends), **settings) == ends
+    over = EndOfRun(segment, wiring(ends_run="task.status", **settings))
+    found = []
+    for tick in range(len(ends)):
+        if tick == 5:
+            writer = open_writer(segment, "task.status")
+            writer.message.state = state
+            writer.write(tick)
+        found.append(over(tick))
+    assert found == ends

@@ -11,10 +11,10 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.standby import ReplicatedTask, list_standbys
 from rack.boards import Rack
-from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
 from rack.boards.faults.describe import describe_fault
+from tests.boards.config.mistakes import read_config
 from tests.boards.conftest import PLANNED, UNJUDGED, MakeConfig
 from tests.boards.run.test_standby import SOON, STANDBY, TWO
 from tests.boards.runs import faulty
@@ -34,7 +34,6 @@ class Ran:
     """A run with a fault, or without."""
 
     def __init__(self, config: RackConfig) -> None:
-        rings: dict[str, MailboxRing] = {}
         self.rows: dict[str, list[Row]] = {box: [] for box in BOXES}
         with Rack(config) as rack:
             rings = {box: MailboxRing(rack.segment, box) for box in BOXES}
@@ -54,10 +53,8 @@ class Ran:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    path = tmp_path_factory.mktemp("plain") / "waves.toml"
-    path.write_text(PLANNED)
-    return Ran(load(str(path), [f"name=test-right-{os.getpid()}", UNJUDGED]))
+def plain() -> Ran:
+    return Ran(read_config(PLANNED, [f"name=test-right-{os.getpid()}", UNJUDGED]))
 
 
 @pytest.mark.parametrize("copy", ["wave", "wave.standby"])

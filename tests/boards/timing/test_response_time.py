@@ -67,15 +67,6 @@ def analysed(tasks: list[Plain], blocked: int = 0) -> list[int | None]:
     return [response(t.cost, tasks[:at], blocked) for at, t in enumerate(tasks)]
 
 
-def check_against_schedule(tasks: list[Plain], blocked: int = 0) -> None:
-    """Check that no job responds otherwise than analysed, unless it waits for the one before it."""
-    bounds = analysed(tasks, blocked)
-    for task, bound, worst in zip(tasks, bounds, seen(tasks, blocked), strict=True):
-        # With full load above, a job has no bound; such sets are not drawn.
-        assert bound is not None, tasks
-        assert bound == worst or (bound < worst and worst > task.period), tasks
-
-
 def drawn(draw: random.Random, full: bool = False) -> list[Plain]:
     """Return a random set of tasks that one processor has time for, fully loaded only if that is
     wanted."""
@@ -113,7 +104,13 @@ def test_published_examples_are_reproduced(tasks: list[Plain], expected: list[in
 def test_response_times_agree_with_simulated_schedules(full: bool, most_blocked: int) -> None:
     draw = random.Random(12)
     for _ in range(SETS):
-        check_against_schedule(drawn(draw, full), draw.randint(0, most_blocked))
+        tasks, blocked = drawn(draw, full), draw.randint(0, most_blocked)
+        bounds = analysed(tasks, blocked)
+        for task, bound, worst in zip(tasks, bounds, seen(tasks, blocked), strict=True):
+            # With full load above, a job has no bound; such sets are not drawn.
+            assert bound is not None, tasks
+            # Otherwise it waits for the one before it.
+            assert bound == worst or (bound < worst and worst > task.period), tasks
 
 
 def test_overload_has_no_bound() -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, load_text, resolve
+from rack.boards.config import load, load_text
 from rack.boards.config.rules.lan import list_network_notes
-from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
-from tests.boards.config.mistakes import find_mistake
+from tests.boards.config.mistakes import find_mistake, list_mistakes
 from tests.boards.lan.racks import rack_text
 
 TLS = "tls/127.0.0.1:7447"
@@ -24,11 +23,7 @@ def mistakes(
     """Return the mistakes of a rack with this endpoint and further lines of `[adapter.lan]`."""
     path = folder / "rack.toml"
     path.write_text(rack_text("cell", listen, connect, peers=["puma"], lan=lan, insecure=False))
-    try:
-        resolve(load(path))
-    except ConfigError as error:
-        return str(error).splitlines()
-    return []
+    return [*map(str, list_mistakes(path))]
 
 
 @pytest.fixture(scope="module")
