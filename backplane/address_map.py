@@ -73,8 +73,11 @@ class AddressMap:
         # Semaphores follow the windows, each in a separate cache line.
         self.wake = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
         self.done = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
-        locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
-        self.locks = {name: self._reserve(CACHE_LINE) for name in locked}
+        self.locks = {
+            box.name: self._reserve(CACHE_LINE)
+            for box in layout.mailboxes
+            if box.protocol == "lock"
+        }
         self.scratch = {host.name: self._reserve(SCRATCH_SIZE) for host in layout.hosts}
         self.size = round_up_to_pages(self._end)
 

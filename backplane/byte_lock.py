@@ -15,10 +15,8 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from weakref import WeakSet
 
-_HELD: set[ProcessLock] = set()
-_OPEN: WeakSet[ByteLock] = WeakSet()
+_OPEN: set[ByteLock] = set()
 _FLOCK = struct.Struct("hhqqi4x")
 """Fields of `struct flock` on 64-bit Linux: type, whence, start, length and pid.
 
@@ -89,22 +87,14 @@ def hold_lock(fd: int, address: int) -> Iterator[None]:
 class ProcessLock(ByteLock):
     """Lock that ends with the process that created it. Forked children do not inherit it."""
 
-    def __init__(self, fd: int, address: int) -> None:
-        super().__init__(fd, address)
-        _HELD.add(self)
-
-    def close(self) -> None:
-        """Release the lock and close its descriptor. Repeated calls have no effect."""
-        _HELD.discard(self)
-        super().close()
-
 
 def _close_inherited() -> None:
     """Close the descriptors of the process locks in a forked child. The parent keeps the locks."""
     # Otherwise the locks would outlast the parent: the kernel keeps a lock as long as any process
     # has its file description open.
-    for lock in [*_HELD]:
-        lock.close()
+    for lock in [*_OPEN]:
+        if isinstance(lock, ProcessLock):
+            lock.close()
 
 
 os.register_at_fork(after_in_child=_close_inherited)

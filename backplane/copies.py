@@ -118,6 +118,5 @@ def switch_segment(segment: Segment, rack: str) -> None:
 def _map_memory(segment: Segment, flags: int, rights: int, fd: int) -> None:
     """Map a file, or anonymous memory if `fd` is -1, in place of a segment's memory."""
     place = ctypes.addressof(ctypes.c_char.from_buffer(segment.bytes))
-    size = segment.map.size
-    if _libc.mmap(place, size, rights, flags | _MAP_FIXED, fd, 0) != place:
+    if _libc.mmap(place, segment.map.size, rights, flags | _MAP_FIXED, fd, 0) != place:
         raise OSError(ctypes.get_errno(), "the memory of a segment cannot be mapped")

@@ -20,7 +20,7 @@ CONTROLLER = "cpuset"
 
 def find_hierarchy() -> Path | None:
     """Return the folder of the cgroup hierarchy, version 2. None if it is not mounted."""
-    rows = (row.split() for row in MOUNTS.read_text().splitlines())
+    rows = map(str.split, MOUNTS.read_text().splitlines())
     return next((Path(folder) for _, folder, kind, *_ in rows if kind == "cgroup2"), None)
 
 
@@ -38,32 +38,29 @@ def reserve_cores(rack: str, cores: Iterable[int]) -> str:
     if root is None:
         return "no cgroup hierarchy of version 2 is mounted"
     release_cores(rack)
-    refusal = ""
     try:
         if CONTROLLER not in (root / "cgroup.controllers").read_text().split():
             return f"{root} has no controller {CONTROLLER}"
         (root / "cgroup.subtree_control").write_text(f"+{CONTROLLER}")
         for core in sorted(set(cores)):
-            group = _name_group(root, rack, core)
+            group = root / f"rack.{rack}.{core}"
             group.mkdir()
             (group / "cpuset.cpus").write_text(str(core))
             partition = group / "cpuset.cpus.partition"
             partition.write_text("root")
             # The kernel accepts the word, and reports here what prevents the partition.
             if (state := partition.read_text().strip()) != "root":
-                refusal = f"core {core}: {state}"
-                break
+                raise OSError(f"core {core}: {state}")
     except OSError as error:
-        refusal = str(error)
-    if refusal:
         release_cores(rack)
-    return refusal
+        return str(error)
+    return ""
 
 
 def enter_core(rack: str, core: int) -> None:
     """Move the calling process to a core that `reserve_cores` has reserved."""
     if (root := find_hierarchy()) is not None:
-        (_name_group(root, rack, core) / "cgroup.procs").write_text("0")
+        (root / f"rack.{rack}.{core}" / "cgroup.procs").write_text("0")
 
 
 def release_cores(rack: str = "*", in_use: Collection[str] = (), wait_s: float = 0.0) -> None:
@@ -91,8 +88,3 @@ def _await_empty(group: Path, wait_s: float) -> None:
         changes.register(events, select.POLLPRI)
         while "populated 1" in events.read() and changes.poll(wait_s * 1000):
             events.seek(0)
-
-
-def _name_group(root: Path, rack: str, core: int) -> Path:
-    """Return the folder of the group of a rack's core."""
-    return root / f"rack.{rack}.{core}"

@@ -175,12 +175,13 @@ class MailboxSpec:
     interrupt: InterruptSpec | None = None
 
     @property
-    def lead_ticks(self) -> int:
-        """Number of ticks from the release of a writing cycle to a tick of the mailbox's grid.
+    def due_offset(self) -> int:
+        """Number of ticks that shows which cycles write the mailbox.
 
-        A cycle writes the mailbox if its release tick plus this number is on the mailbox's grid.
+        A cycle writes it if the sum of its release tick and this number is a multiple of `every`.
+        The message then becomes visible at a tick of the mailbox's grid.
         """
-        return self.delay if self.interrupt is None else self.interrupt.ahead
+        return (self.delay if self.interrupt is None else self.interrupt.ahead) - self.phase
 
     @property
     def is_tick_based(self) -> bool:
@@ -303,9 +304,8 @@ class Layout:
 
     def list_copies(self, task: str) -> tuple[TaskSpec, ...]:
         """Return a task, followed by its standbys in their order."""
-        spec = self.find_task(task)
-        standbys = (s for s in self.tasks if s.role == "standby" and s.board == spec.name)
-        return (spec, *standbys)
+        standbys = (s for s in self.tasks if s.role == "standby" and s.board == task)
+        return (self.find_task(task), *standbys)
 
     def find_first_copy(self, task: str) -> str:
         """Return the name of the task that a standby copies. For other tasks, return their own."""

@@ -45,7 +45,7 @@ _PRESENT = 63
 """Bit of an entry of /proc/self/pagemap that is set if the page is in memory."""
 
 
-def hold_memory(lockstep: bool = False) -> None:
+def hold_memory(lockstep: bool) -> None:
     """Disable the garbage collector, and have the kernel lock each page when it is touched.
 
     In lockstep no memory is locked: locking takes a sixth of the launch time, and page faults do

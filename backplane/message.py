@@ -99,13 +99,14 @@ def _complete_field(declared: Field, name: str, hint: Any) -> Field:
     if isinstance(declared.kind, MessageType):
         return replace(declared, name=name, unit="")
     is_name = isinstance(hint, type) and issubclass(hint, IntEnum)
+    name_of_hint = getattr(hint, "__name__", hint)
     python = IntEnum if is_name else hint if hint in _KINDS else np.ndarray
     usual, permitted = _KINDS[python]
     kind = declared.kind or usual
     if np.dtype(kind).kind not in permitted:
-        raise ValueError(f"numpy type '{kind}' does not hold {_format_hint(hint)}")
+        raise ValueError(f"numpy type '{kind}' does not hold {name_of_hint}")
     if (python is np.ndarray) != bool(declared.shape):
-        raise ValueError(f"shape {declared.shape} does not suit {_format_hint(hint)}")
+        raise ValueError(f"shape {declared.shape} does not suit {name_of_hint}")
     unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
     if unit == _UNSTATED:
         raise ValueError('has no unit; the unit of a pure number is "1"')
@@ -310,15 +311,13 @@ def _build_class(cls: type[B], dtype: np.dtype) -> type[B]:
         dtype: dtype of its messages, with all sizes known.
     """
     declared = {field.name: field for field in cls.message_type.fields}
-    columns = {name: dtype[name] for name in dtype.names or ()}
     body = {
-        name: _build_scalar_property(name, column, declared.get(name))
-        for name, column in columns.items()
-        if not (column.shape or column.names)
+        name: _build_scalar_property(name, dtype[name], declared.get(name))
+        for name in dtype.names or ()
+        if not (dtype[name].shape or dtype[name].names)
     }
     kind = cls.message_type
-    options = {"version": kind.version, "message": kind.name}
-    resolved_class: Any = type(cls.__name__, (cls,), body, **options)
+    resolved_class: Any = type(cls.__name__, (cls,), body, version=kind.version, message=kind.name)
     return resolved_class  # type: ignore[no-any-return]
 
 
@@ -332,11 +331,6 @@ def _build_scalar_property(name: str, dtype: np.dtype, declared: Field | None) -
         member = {int(each): each for each in declared.unit}.get
         return property(lambda self: member(value := self._views[name].item(), value))
     return property(lambda self: self._views[name].item())
-
-
-def _format_hint(hint: Any) -> str:
-    """Return the name of an annotation for an error message."""
-    return str(getattr(hint, "__name__", hint))
 
 
 def _can_store(kind: str, value: Any) -> bool:

@@ -75,10 +75,8 @@ class MessageType:
         )
         missing = [s for s in field.shape if isinstance(s, str) and s not in sizes]
         if missing:
-            known = ", ".join(sorted(sizes)) or "none"
             raise MailboxError(
                 f"message '{self.name}' field '{field.name}': size '{missing[0]}' is unknown; known"
-                f" sizes: {known}"
+                f" sizes: {', '.join(sorted(sizes)) or 'none'}"
             )
-        shape = tuple(sizes[s] if isinstance(s, str) else s for s in field.shape)
-        return field.name, kind, shape
+        return field.name, kind, tuple(sizes[s] if isinstance(s, str) else s for s in field.shape)

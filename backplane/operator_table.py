@@ -190,8 +190,7 @@ class OperatorTable:
 
     def list_waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
-        entries = [entry for entry in self.entries if self.is_waiting(entry)]
-        return sorted(entries, key=lambda entry: entry.ticket)
+        return sorted(filter(self.is_waiting, self.entries), key=lambda entry: entry.ticket)
 
     def find_missing(self, requests: Sequence[Request]) -> list[Request]:
         """Return the commands of a recorded run for which no request waits in the table.
@@ -228,9 +227,9 @@ class OperatorTable:
         """
         settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
         if not settled:
-            why = f"{len(self.entries)} commands wait for their ticks"
             raise OperatorTableError(
-                f"the operator table is full: {why}; try again once one of them has been issued"
+                f"the operator table is full: {len(self.entries)} commands wait for their ticks;"
+                " try again once one of them has been issued"
             )
         entry = min(settled, key=lambda e: (e.stage, e.serial))
         entry.stage = RequestStage.FREE

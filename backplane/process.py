@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import platform
 import re
 import select
 import signal
@@ -135,8 +134,8 @@ _RECLAIM = 2
 
 A first cycle needs this, because it takes longer than the later ones.
 """
-_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-"""System call number by machine, since the C library has no function for it."""
+_SCHED_SETATTR = 314
+"""System call number on x86-64, since the C library has no function for it."""
 
 
 class Reservation(NamedTuple):
@@ -146,7 +145,7 @@ class Reservation(NamedTuple):
     period_ns: int
 
 
-def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
+def take_core(core: int, priority: int, reservation: Reservation | None) -> int:
     """Pin the calling process to a core and raise its priority, if allowed.
 
     Args:
@@ -178,15 +177,10 @@ def reserve_time(reservation: Reservation, pid: int = 0) -> str:
     times = runtime_ns, period_ns, period_ns
     record = Struct("=IIQiIQQQ")
     attributes = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
-    number = _SCHED_SETATTR.get(platform.machine())
-    if number is None:
-        return f"not known on {platform.machine()}"
-    if _libc.syscall(number, pid, attributes, 0) == 0:
+    if _libc.syscall(_SCHED_SETATTR, pid, attributes, 0) == 0:
         return ""
     code = ctypes.get_errno()
-    return (
-        f"{os.strerror(code)}; {PERMITS_RESERVATIONS}" if code == errno.EPERM else os.strerror(code)
-    )
+    return os.strerror(code) + f"; {PERMITS_RESERVATIONS}" * (code == errno.EPERM)
 
 
 PERMITS_RESERVATIONS = (
@@ -249,8 +243,7 @@ def describe_refusal(error: OSError) -> str:
     if error.errno not in limits:
         return str(error)
     resource, option, limit = limits[error.errno]
-    maximum = getrlimit(limit)[0]
-    return f"{error.strerror}: the limit is {maximum} {resource} (ulimit -{option})"
+    return f"{error.strerror}: the limit is {getrlimit(limit)[0]} {resource} (ulimit -{option})"
 
 
 def set_priority(priority: int, pid: int = 0) -> bool:
@@ -263,9 +256,10 @@ def set_priority(priority: int, pid: int = 0) -> bool:
     Returns:
         False if the system refuses.
     """
-    policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
     try:
-        os.sched_setscheduler(pid, policy, os.sched_param(priority))
+        os.sched_setscheduler(
+            pid, os.SCHED_FIFO if priority else os.SCHED_OTHER, os.sched_param(priority)
+        )
     except (PermissionError, ProcessLookupError):
         return False
     return True

@@ -48,14 +48,12 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
     with os.fdopen(os.open(path, flags), "rb") as file:
         _check_status(path, os.fstat(file.fileno()), limit_bytes)
-        pieces = []
-        size = 0
+        content = bytearray()
         # Files of /proc and files that are being written may contain more bytes than their size.
         while piece := file.read(PIECE_BYTES):
-            pieces.append(piece)
-            size += len(piece)
-            _check_size(path, size, limit_bytes)
-    return b"".join(pieces)
+            content += piece
+            _check_size(path, len(content), limit_bytes)
+    return bytes(content)
 
 
 def check_regular_file(path: Path, limit_bytes: int) -> None:
@@ -75,8 +73,8 @@ def check_regular_file(path: Path, limit_bytes: int) -> None:
 def _check_status(path: Path, status: os.stat_result, limit_bytes: int) -> None:
     """Raise `RefusedFileError` unless a status describes a regular file within the limit."""
     if not stat.S_ISREG(status.st_mode):
-        kind = _KINDS[stat.S_IFMT(status.st_mode)]
-        raise RefusedFileError(errno.EINVAL, f"not a regular file, but a {kind}", str(path))
+        reason = f"not a regular file, but a {_KINDS[stat.S_IFMT(status.st_mode)]}"
+        raise RefusedFileError(errno.EINVAL, reason, str(path))
     _check_size(path, status.st_size, limit_bytes)
 
 

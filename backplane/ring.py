@@ -33,6 +33,10 @@ class Ring:
         dtype: Type of a record.
         head: Word with the number of records written.
         before: Number of records of the run that this run continues, which are skipped.
+
+    Attributes:
+        taken: Number of records that were read or skipped. A reader that continues the work of
+            another sets it.
     """
 
     def __init__(
@@ -44,12 +48,12 @@ class Ring:
         self._dtype = dtype
         self._head = head
         self._depth = len(self._rows)
-        self.before = self._taken = before
+        self.before = self.taken = before
 
     @property
     def waiting_count(self) -> int:
         """Number of records written and not yet read."""
-        return self._written_count - self._taken
+        return self._written_count - self.taken
 
     @property
     def _written_count(self) -> int:
@@ -62,18 +66,14 @@ class Ring:
             raise DamageError(f"a ring cannot have {count} records")
         return count
 
-    def resume_after(self, taken: int) -> None:
-        """Skip the first `taken` records, which another reader has already read."""
-        self._taken = taken
-
     def read_new_rows(self) -> NewRows:
         """Read the records written since the last call, except those already overwritten."""
         head = self._written_count
-        first = max(self._taken + 1, head - self._depth + 1)
+        first = max(self.taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # The writer may have overwritten the oldest rows during the copy.
         torn = max(0, compute_oldest_intact(self._written_count, self._depth) - first)
-        lost = first - self._taken - 1 + min(torn, len(rows))
+        lost = first - self.taken - 1 + min(torn, len(rows))
         # The head of a mailbox is set back if a stopped writer continues after a hand-over.
-        self._taken = max(self._taken, head)
+        self.taken = max(self.taken, head)
         return NewRows(rows[torn:], lost)

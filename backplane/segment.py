@@ -176,23 +176,16 @@ class Segment:
             os.close(fd)
             life.close()
             if isinstance(error, FileExistsError):
-                why = (
-                    "already has a segment: it is running, or was killed; see 'rack list' and"
-                    " 'rack clean'"
-                )
-                raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            file_system = os.statvfs(SHM_FOLDER)
-            whole, free = (
-                count * file_system.f_frsize
-                for count in (file_system.f_blocks, file_system.f_bavail)
-            )
-            space_text = (
-                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; for a container, --shm-size"
-                " sets its size"
-            )
+                raise SegmentError(
+                    f"rack '{layout.rack}' already has a segment: it is running, or was killed;"
+                    " see 'rack list' and 'rack clean'"
+                ) from None
+            space = os.statvfs(SHM_FOLDER)
             raise SegmentError(
                 f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}:"
-                f" {space_text}"
+                f" {SHM_FOLDER} has {space.f_blocks * space.f_frsize} bytes,"
+                f" {space.f_bavail * space.f_frsize} of them free; for a container, --shm-size"
+                " sets its size"
             ) from None
         return segment
 
@@ -260,7 +253,8 @@ class Segment:
         if (kind := find_foreign_kind(rack)) is not None:
             raise SegmentError(f"rack '{rack}': {get_shm_path(rack)} is a {kind}, not a segment")
         try:
-            shm = posix_ipc.SharedMemory(_shm_name(rack))
+            # `posix_ipc` expects a leading slash.
+            shm = posix_ipc.SharedMemory(f"/{PREFIX}{rack}")
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
             why = (
                 "belongs to another user"
@@ -273,8 +267,10 @@ class Segment:
         status = os.fstat(shm.fd)
         if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
             os.close(shm.fd)
-            why = f"owner {status.st_uid}, {status.st_size} bytes: not a segment of this user"
-            raise SegmentError(f"rack '{rack}': {why}")
+            raise SegmentError(
+                f"rack '{rack}': owner {status.st_uid}, {status.st_size} bytes: not a segment of"
+                " this user"
+            )
         return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
 
     def read_head(self) -> None:
@@ -321,14 +317,6 @@ class Segment:
         start = self.map.blocks[task] // 8
         return self.words[start : start + BLOCK_SIZE // 8]
 
-    def get_copy_blocks(self, task: str) -> list[memoryview]:
-        """Return the control blocks of all copies of a task, which are several if it has standbys.
-
-        Raises:
-            KeyError: There is no such task.
-        """
-        return [self.get_block(copy.name) for copy in self.layout.list_copies(task)]
-
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task up to `tick`.
 
@@ -371,9 +359,8 @@ class Segment:
         It is 0 if that program has another PID namespace, as in another container. The number would
         refer to a different process in this namespace.
         """
-        words = self.words
-        is_here = words[Head.LAUNCHER_NAMESPACE] == _pid_namespace()
-        return words[Head.LAUNCHER_PID] if is_here else 0
+        is_here = self.words[Head.LAUNCHER_NAMESPACE] == _pid_namespace()
+        return self.words[Head.LAUNCHER_PID] if is_here else 0
 
     @property
     def launcher_text(self) -> str:
@@ -383,7 +370,7 @@ class Segment:
     @property
     def launcher_is_alive(self) -> bool:
         """True if the process that created the segment is still running."""
-        return is_locked(self.fd, _LAUNCHER_LOCK)
+        return self.is_locked(_LAUNCHER_LOCK)
 
     def await_launcher(self, timeout_s: float) -> bool:
         """Wait until the launcher has ended or closed its segment. Returns False on timeout."""
@@ -458,7 +445,7 @@ def unlink_segment(rack: str) -> None:
         SegmentError: The segment belongs to another user.
     """
     try:
-        posix_ipc.unlink_shared_memory(_shm_name(rack))
+        posix_ipc.unlink_shared_memory(f"/{PREFIX}{rack}")
     except posix_ipc.ExistentialError:
         return
     except posix_ipc.PermissionsError:
@@ -475,11 +462,6 @@ def get_shm_path(rack: str) -> Path:
 def _pid_namespace() -> int:
     """Return the inode of this process's PID namespace, which identifies the namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
-
-
-def _shm_name(rack: str) -> str:
-    """Return the name of a rack's segment as `posix_ipc` expects it, with a leading slash."""
-    return f"/{PREFIX}{rack}"
 
 
 def restore_layout(plain: dict[str, Any]) -> Layout:

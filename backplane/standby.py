@@ -108,8 +108,8 @@ def _read_task(segment: Segment, name: str) -> ReplicatedTask:
         is_active, is_lost = number == words[Block.ACTIVE], bool(block[Block.LOST])
         aligned = block[Block.ALIGNED] - 1
         aligned_since = None if aligned < 0 or is_active or is_lost else aligned
-        place = spec.name, spec.slot, spec.core, block[Block.PID]
-        copies.append(Copy(*place, is_active, is_lost, aligned_since))
+        pid = block[Block.PID]
+        copies.append(Copy(spec.name, spec.slot, spec.core, pid, is_active, is_lost, aligned_since))
         if not is_active:
             ready = "not ready" if aligned_since is None else f"ready since tick {aligned_since}"
             others.append(f"; {spec.name} {'lost' if is_lost else ready}")

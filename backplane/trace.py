@@ -23,25 +23,23 @@ from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
-RECORD = np.dtype(
-    [
-        ("tick", "i8"),  # release, in ticks
-        ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
-        ("start_ns", "i8"),
-        # The executor has read its plan over the bus (C of fig. 4). start_ns without a plan.
-        ("plan_ns", "i8"),
-        ("read_ns", "i8"),  # command, status and plan read
-        ("process_ns", "i8"),  # process done
-        ("end_ns", "i8"),  # command and status written
-        # Flag in the low 16 bits. The upper bits are the number of releases skipped just before.
-        ("flags", "i8"),
-        ("state", "i8"),  # state of the level
-        # Processor time of the thread since the last record: this cycle and its wake-up.
-        ("processor_ns", "i8"),
-        ("closed_ns", "i8"),  # end of the bookkeeping of the previous cycle, 0 in the first
-    ]
+FIELDS = (
+    "tick",  # release, in ticks
+    "release_ns",  # the grid point of that tick, CLOCK_MONOTONIC
+    "start_ns",
+    # The executor has read its plan over the bus (C of fig. 4). start_ns without a plan.
+    "plan_ns",
+    "read_ns",  # command, status and plan read
+    "process_ns",  # process done
+    "end_ns",  # command and status written
+    # Flag in the low 16 bits. The upper bits are the number of releases skipped just before.
+    "flags",
+    "state",  # state of the level
+    # Processor time of the thread since the last record: this cycle and its wake-up.
+    "processor_ns",
+    "closed_ns",  # end of the bookkeeping of the previous cycle, 0 in the first
 )
-FIELDS = tuple(RECORD.names or ())
+RECORD = np.dtype([(name, "i8") for name in FIELDS])
 SKIPPED_SHIFT = 16
 
 
@@ -82,14 +80,11 @@ class TraceWriter:
 
 def open_trace_ring(segment: Segment, task: str) -> Ring:
     """Open the reading end of a task's trace ring. Its rows have dtype `RECORD`."""
-    spec = segment.layout.find_task(task)
+    depth = segment.layout.find_task(task).depth
     block = segment.get_block(task)
-    memory = segment.get_bytes(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
+    memory = segment.get_bytes(segment.map.traces[task], depth * TRACE_RECORD_SIZE)
     return Ring(
-        memory,
-        RECORD,
-        block[Block.TRACE_HEAD : Block.TRACE_HEAD + 1],
-        block[Block.TRACE_FIRST],
+        memory, RECORD, block[Block.TRACE_HEAD : Block.TRACE_HEAD + 1], block[Block.TRACE_FIRST]
     )
 
 

@@ -255,10 +255,9 @@ class Scheduler(IntEnum):
         """Name in configs and commands, such as "fixed-priority"."""
         return self.name.lower().replace("_", "-")
 
-    @classmethod
-    def find(cls, word: str) -> Scheduler:
-        """Return the scheduler of a name in a config. Raises `KeyError` if there is none."""
-        return cls[word.upper().replace("-", "_")]
+
+SCHEDULERS = {scheduler.word: scheduler for scheduler in Scheduler}
+"""Schedulers by their names in configs."""
 
 
 class Box:

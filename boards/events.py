@@ -17,7 +17,7 @@ from rack.backplane.words import Block, Run, System
 if TYPE_CHECKING:
     from rack.levels.tables import GoalConfig
 
-OfRun = Literal[
+EventKind = Literal[
     "launch",
     "waiting",
     "ready",
@@ -29,9 +29,13 @@ OfRun = Literal[
     "end",
     "recorder",
     "command",
+    "fault",
+    "detection",
+    "miss",
+    "reaction",
+    "recovery",
+    "held",
 ]
-OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
-EventKind = OfRun | OfFaults
 CONTINUATION_CODE = "continues"
 """Code of the launch event of a run that continues another one. Its tick is the run's first."""
 OF_LAUNCH = ("launch", "ready", "start")
@@ -132,8 +136,10 @@ def format_brakings(brakings: Sequence[Braking]) -> str:
         brakings: Periods for which brakes were engaged, at least one.
     """
     longest = max(brakings, key=lambda braking: braking.lasted_ms)
-    total_ms = sum(braking.lasted_ms for braking in brakings)
-    times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
+    times = (
+        f"{sum(braking.lasted_ms for braking in brakings):g} ms in all, longest"
+        f" {longest.lasted_ms:g} ms at tick {longest.since}"
+    )
     reasons = ", ".join(
         f"{why} ({count})"
         for why, count in Counter(braking.why for braking in brakings).most_common()
@@ -294,14 +300,26 @@ class Ending:
         longest: Number of ticks after which the run ends, as in `ClockWiring`.
     """
 
-    def __init__(
-        self, segment: Segment, ends_run: str | None, silent: int, longest: int = 0
-    ) -> None:
+    def __init__(self, segment: Segment, ends_run: str | None, silent: int, longest: int) -> None:
         self._segment = segment
         self._ends_run = ends_run
-        self._silent = silent
         self._longest = longest
-        self._observer = None if ends_run is None else open_observer(segment, ends_run)
+        self._status: AnyMessage | None = None
+        self._counts_moves = self._is_too_long = False
+        self._silent_ticks = 0
+        if ends_run is not None:
+            observer = open_observer(segment, ends_run)
+            reading = observer.peek()
+            self._status = reading.message
+            # The field `moves` of a status counts the moves of the task.
+            self._counts_moves = any(
+                field.name == "moves" and not field.shape for field in observer.spec.fields
+            )
+            if reading.message.state not in (State.DONE, State.ERROR):
+                ticks = segment.words[System.TICK]
+                silent_ticks = ticks - (observer.newest if reading.has_message else 0)
+                self._silent_ticks = silent_ticks if silent_ticks > silent else 0
+                self._is_too_long = 0 < longest <= ticks
 
     def find_final_state(self) -> tuple[str, str]:
         """Return the last state of the level that ends the run, and the reason for this state.
@@ -309,13 +327,15 @@ class Ending:
         Both are empty if no level ends the run. If the level has not written a status for too long,
         the reason states for how long.
         """
-        if self._observer is None:
+        status = self._status
+        if status is None:
             return "", ""
-        status = self._observer.peek().message
         tick_s = self._segment.layout.clock_ns * 1e-9
         reason = get_reason(status)
-        if silent_ticks := self._compute_silent_ticks():
-            reason = f"'{self._ends_run}' has not been written for {silent_ticks * tick_s:g} s"
+        if self._silent_ticks:
+            reason = (
+                f"'{self._ends_run}' has not been written for {self._silent_ticks * tick_s:g} s"
+            )
         elif self._is_too_long:
             reason = (
                 f"'{self._ends_run}' has been neither done nor error for {self._longest * tick_s:g}"
@@ -403,12 +423,11 @@ class Ending:
                 box.message == "scene"
                 and (scene := open_observer(self._segment, box.name).peek()).has_message
             ):
-                rows = scene.message.position
                 return tuple(
                     ObjectEnd(
                         goal.object,
                         goal.position,
-                        (ended := rows[row].tolist()),
+                        (ended := scene.message.position[row].tolist()),
                         round(1e3 * math.dist(ended, goal.position), 3),
                         goal.tolerance_mm,
                     )
@@ -418,43 +437,13 @@ class Ending:
 
     def find_cause(self) -> Cause:
         """Return why a run ended. Call this only if the run was not stopped by a request."""
-        if self._observer is None:
+        status = self._status
+        if status is None:
             return "time over"
-        status = self._observer.peek().message
-        is_ended = self._compute_silent_ticks() or self._is_too_long
-        if status.state != State.ERROR and not is_ended:
+        if status.state != State.ERROR and not (self._silent_ticks or self._is_too_long):
             return "task done" if status.state == State.DONE else "time over"
-        # The field `moves` of a status counts the moves of the task. A refused task has none.
-        counts_moves = any(
-            field.name == "moves" and not field.shape for field in self._observer.spec.fields
-        )
-        is_refused = counts_moves and not status.moves
-        return "task refused" if is_refused else "task failed"
-
-    @property
-    def _is_too_long(self) -> bool:
-        """Whether the run has lasted too long without a status with state done or error.
-
-        Read this only if a level ends the run.
-        """
-        assert self._observer is not None, "some level ends the run"
-        state = self._observer.peek().message.state
-        ticks = self._segment.tick
-        return 0 < self._longest <= ticks and state not in (State.DONE, State.ERROR)
-
-    def _compute_silent_ticks(self) -> int:
-        """Return for how many ticks the level that ends the run has written no status.
-
-        The result is 0 if this is not more than permitted, or if the last status has state done or
-        error. Call this only if a level ends the run.
-        """
-        assert self._observer is not None, "some level ends the run"
-        reading = self._observer.peek()
-        if reading.message.state in (State.DONE, State.ERROR):
-            return 0
-        newest = self._observer.newest if reading.has_message else 0
-        ticks = self._segment.tick - newest
-        return ticks if ticks > self._silent else 0
+        # A refused task has made no moves.
+        return "task refused" if self._counts_moves and not status.moves else "task failed"
 
 
 @dataclass(frozen=True)

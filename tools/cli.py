@@ -227,9 +227,9 @@ def _start_crate_early(arguments: Sequence[str]) -> AbstractContextManager[Crate
         or COMPLETION_VARIABLE in os.environ
     ):
         return nullcontext()
-    from rack.boards.crate.line import NO_WINDOWS, ONE_THREAD, CrateLine, WarmCrate
+    from rack.boards.crate.line import LIBRARIES, CrateLine, WarmCrate
 
-    os.environ.update(ONE_THREAD | NO_WINDOWS)
+    os.environ.update(LIBRARIES)
     return (
         WarmCrate() if any(argument.startswith("--from") for argument in arguments) else CrateLine()
     )

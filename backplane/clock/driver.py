@@ -21,7 +21,7 @@ from typing import Protocol
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.released_task import ReleasedTask, Watchdog, sort_by_priority
-from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.clock.wake import CHECK_NS
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
@@ -88,6 +88,7 @@ class ClockDriver(ABC):
         self.controller: Controller | None = None
         self.skip = 0
         self.is_flooded = False
+        self._next = 0  # earliest possible end tick of the run, in lockstep the next tick
         self.alarms = alarms or AlarmWriter(segment, CLOCK)
         self.watchdog = Watchdog(self.alarms, self.words[System.PERIOD_NS])
         self._ended = ended
@@ -146,11 +147,6 @@ class ClockDriver(ABC):
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
-    @property
-    def first_end_tick(self) -> int:
-        """Earliest possible end tick of the run. The end tick itself is not executed."""
-        return 0
-
     def wait_until_settled(self) -> None:
         """In lockstep, wait until every task has finished its last release, including plans.
 
@@ -186,7 +182,7 @@ class ClockDriver(ABC):
         # robot's task ends, and a run that continues this one may end at that tick.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
-            stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
+            stop = words[System.STOP_TICK] = max(end_tick, self._next, 1)
         return bool(stop) and tick >= stop
 
     def end_run(self) -> None:
@@ -215,8 +211,7 @@ class RealtimeDriver(ClockDriver):
 
     def run(self) -> None:
         """Run the clock until the run is over or the launcher has ended."""
-        words = self.words
-        beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
+        beat = max(1, CHECK_NS // self._period_ns)
         for task in self.tasks:
             if task.sleeps:
                 # Wake the task once. The grid is known now, so it can sleep until its grid points.
@@ -224,7 +219,7 @@ class RealtimeDriver(ClockDriver):
         last = self.first_tick - 1
         # The grid point of tick 0 is a little after the clock's start, so wait for it too.
         tick = self._sleep_until_next(last)
-        words[System.STATE] = Run.RUNNING
+        self.words[System.STATE] = Run.RUNNING
         while not self.is_over(tick):
             if self.begin_tick(tick):
                 self._release_tasks(tick, last)

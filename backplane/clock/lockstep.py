@@ -26,7 +26,7 @@ from collections.abc import Callable
 
 from rack.backplane.clock.driver import ClockDriver, FindEndTick
 from rack.backplane.clock.released_task import ReleasedTask
-from rack.backplane.clock.wake import CHECK_S
+from rack.backplane.clock.wake import CHECK_NS
 from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
@@ -86,17 +86,10 @@ class LockstepDriver(ClockDriver):
         self.snapshot: Callable[[int], int] = lambda tick: sys.maxsize
         self._snapshot_at = 0
         self.permits_batches = not one_at_a_time
+        # The configured end of a run that continues another may be before its first tick. This run
+        # then ends at once.
         self._next = self.first_tick
         self._last = self._next - 1
-
-    @property
-    def first_end_tick(self) -> int:
-        """Earliest possible end tick of the run: the next tick.
-
-        The configured end of a run that continues another may be before its first tick. Such a run
-        ends at once.
-        """
-        return self._next
 
     def run(self) -> None:
         """Run the clock until the run is over or the launcher has ended."""
@@ -145,11 +138,10 @@ class LockstepDriver(ClockDriver):
             return tick + 1
         if alone.is_stopped or alone.is_waiting:
             return tick + 1
-        words = self.words
         end = min(tick + MAX_BATCH_TICKS, self._snapshot_at, controller.find_next_work_tick(tick))
-        if stop := words[System.STOP_TICK]:
+        if stop := self.words[System.STOP_TICK]:
             end = min(end, stop)
-        if (hold := words[System.HOLD_AT]) > 0:
+        if (hold := self.words[System.HOLD_AT]) > 0:
             end = min(end, hold - 1)
         for task in self.tasks:
             if end <= tick + 1:
@@ -203,8 +195,9 @@ class LockstepDriver(ClockDriver):
         Returns:
             False if the launcher has ended or the host requests the end of the run.
         """
-        due = (task for task in self.tasks if 0 < task.block[Block.FINISH] <= tick)
-        return all(self.resume_cycle(task) for task in due)
+        return all(
+            self.resume_cycle(task) for task in self.tasks if 0 < task.block[Block.FINISH] <= tick
+        )
 
     def resume_cycle(self, task: ReleasedTask) -> bool:
         """Continue the cycle of a waiting task, and wait until it has ended or waits again.
@@ -251,7 +244,7 @@ class LockstepDriver(ClockDriver):
             return False
         # Lockstep does not wait for a process that has been stopped by a signal.
         task.check_stopped()
-        task.done.set_deadline(time.monotonic_ns() + int(CHECK_S * 1e9))
+        task.done.set_deadline(time.monotonic_ns() + CHECK_NS)
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:

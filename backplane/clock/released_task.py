@@ -63,8 +63,7 @@ class ReleasedTask:
 
     def can_take_release(self, release: int) -> bool:
         """Check that at tick `release` the task is neither lost nor still working on a plan."""
-        block = self.block
-        return block[Block.DEADLINE] <= release and not self.is_lost
+        return self.block[Block.DEADLINE] <= release and not self.is_lost
 
     def release(self, tick: int, more: int = 0) -> None:
         """Release the task, and update `missed` and its deadline.
@@ -211,13 +210,12 @@ class Watchdog:
         if self._is_hanging(task):
             self.losses += 1
             task.mark_lost(tick)
-            self._alarms.raise_alarm(
-                tick, Alarm.HANG, task.index, missed, tick - missed * spec.every
-            )
+            found = Alarm.HANG
         elif missed == RELEASES_MISSED:
-            self._alarms.raise_alarm(
-                tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every
-            )
+            found = Alarm.STARVED
+        else:
+            return
+        self._alarms.raise_alarm(tick, found, task.index, missed, tick - missed * spec.every)
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
         """Check whether a task hangs: it is stopped, or has waited or computed for too long.

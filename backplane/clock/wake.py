@@ -35,6 +35,7 @@ from rack.backplane.words import Block, Run, System
 _STOPPED = int(Run.STOPPED)
 CHECK_S = 0.25
 """Time after which a waiting task checks whether the launcher is still alive."""
+CHECK_NS = int(CHECK_S * 1e9)
 MAX_SLEEP_NS = 25_000_000
 """Longest sleep that cannot be interrupted."""
 POLLS_PER_CHECK = 100_000
@@ -90,8 +91,7 @@ class NextCycle:
         # A restarted task skips the releases before its start. This process may write RELEASED
         # here, because the clock does not write it before the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
-        self._due = self._block[Block.DONE] + 1
-        self.skip_until(self._due)
+        self._due = spec.grid.find_tick(self._block[Block.DONE] + 1)
         self._slack = 0
         self.skipped = 0
         self.copy: Callable[[], None] | None = None
@@ -151,7 +151,7 @@ class NextCycle:
         self._due = release + every
         self._slack = every * (self._spec.within_cycles - 1)
         if self._silent_clock is not None:
-            self._silent_clock.record_release()
+            self._silent_clock.is_reported = False
         return release
 
     def _sleep_until_release(self) -> bool:
@@ -165,7 +165,7 @@ class NextCycle:
         """
         words = self._words
         now = monotonic_ns()
-        deadline = bound = now + int(CHECK_S * 1e9)
+        deadline = bound = now + CHECK_NS
         is_due = False
         # The grid is unknown until the clock starts. When it starts, it wakes every task once.
         if epoch := words[System.EPOCH_NS]:
@@ -189,12 +189,12 @@ class NextCycle:
         # costs one extra check.
         if not self._semaphore.wait():
             return True
-        self._semaphore.set_deadline(monotonic_ns() + int(CHECK_S * 1e9))
+        self._semaphore.set_deadline(monotonic_ns() + CHECK_NS)
         return self._check_after_timeout()
 
     def _block_on_semaphore(self) -> bool:
         """Wait for the semaphore in real time. Returns False if the launcher has ended."""
-        bound = int(CHECK_S * 1e9)
+        bound = CHECK_NS
         if self._silent_clock is not None and self._has_begun:
             bound = min(bound, self._silent_clock.compute_patience_ns(self._due))
         self._semaphore.set_deadline(monotonic_ns() + bound)
@@ -270,12 +270,9 @@ class StoppedClockDetector:
         self._words = segment.words
         self._clock = SystemClock(segment)
         self._alarms = alarms
-        self._is_reported = False
+        self.is_reported = False
+        """True once the alarm is raised. A release resets it, as the clock has run since."""
         self._waited_at = -1
-
-    def record_release(self) -> None:
-        """Record that the clock has released the task. The clock's next stop raises an alarm."""
-        self._is_reported = False
 
     def compute_patience_ns(self, expected: int) -> int:
         """Return the time, in ns, to wait for a release before the clock is checked.
@@ -294,7 +291,7 @@ class StoppedClockDetector:
         now = self._clock.compute_tick()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_PATIENCE_TICKS:
-            self._is_reported = False
+            self.is_reported = False
             return
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
@@ -309,11 +306,11 @@ class StoppedClockDetector:
         # If a new tick has begun meanwhile, or the run has ended, the clock is running.
         if (
             has_stopped
-            and not self._is_reported
+            and not self.is_reported
             and self._words[System.TICK] == newest
             and not self._clock.is_stopped
         ):
-            self._is_reported = True
+            self.is_reported = True
             self._alarms.raise_alarm(
                 now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest
             )

@@ -48,9 +48,10 @@ class MailboxClaim:
             MailboxError: The mailbox has another writer.
         """
         if not self.try_lock():
-            pid = self._box[Box.WRITER_PID]
             self._lock.close()
-            raise MailboxError(f"mailbox '{self._name}' already has a writer (process {pid})")
+            raise MailboxError(
+                f"mailbox '{self._name}' already has a writer (process {self._box[Box.WRITER_PID]})"
+            )
         head = self._box[Box.HEAD]
         self.begin_epoch(head)
         return head
@@ -84,8 +85,7 @@ class MailboxClaim:
 
     def set_begun(self, head: int) -> None:
         """Correct the serial of the newest message before the epoch of this claim."""
-        epoch = get_epoch(self._slots.signature)
-        self._box[Box.BEGUN + epoch % Box.EPOCHS] = head
+        self._box[Box.BEGUN + get_epoch(self._slots.signature) % Box.EPOCHS] = head
 
     @property
     def is_valid(self) -> bool:

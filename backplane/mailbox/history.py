@@ -49,10 +49,10 @@ class MailboxRing(Ring):
 
     def __init__(self, segment: Segment, name: str) -> None:
         spec = segment.layout.find_mailbox(name)
-        address = segment.map.mailboxes[name]
         self._stride = compute_slot_stride(spec)
         self._box = segment.get_box(name)
-        memory = segment.get_bytes(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
+        first = segment.map.mailboxes[name] + MAILBOX_HEAD_SIZE
+        memory = segment.get_bytes(first, spec.depth * self._stride)
         head = self._box[Box.HEAD : Box.HEAD + 1]
         super().__init__(memory, build_row_dtype(spec), head, self._box[Box.FIRST])
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
@@ -62,7 +62,7 @@ class MailboxRing(Ring):
         rows, lost = super().read_new_rows()
         if not len(rows):
             return NewRows(rows, lost)
-        serials = np.arange(self._taken - len(rows), self._taken) + 1
+        serials = np.arange(self.taken - len(rows), self.taken) + 1
         holder, begun = self._read_claim()
         signatures = rows["epoch"]
         epochs = signatures & EPOCH_MASK
@@ -73,7 +73,7 @@ class MailboxRing(Ring):
         if not lawful[-1]:
             # The newest message is forged. The true writer will overwrite it with its next message,
             # which has the same serial, so read this row again at the next call.
-            self._taken -= 1
+            self.taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
         checks = (
             xxh3(content.tobytes(), chain)
@@ -134,8 +134,7 @@ def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
             and slots.is_from_claimant(0)
         ):
             serial -= 1
-        chain = slots.chain if serial > oldest else 0
-        chain_by_mailbox[spec.name] = (serial, chain)
+        chain_by_mailbox[spec.name] = serial, slots.chain if serial > oldest else 0
     return chain_by_mailbox
 
 

@@ -76,11 +76,10 @@ class HostReader:
         Returns:
             The message, which is valid until the next call. None if it was rejected.
         """
-        head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
         # If more messages wait than the ring may hold, a faulty writer has overwritten some of
         # them.
-        serial = max(oldest, head - self.spec.depth + SPARE_SLOTS)
+        serial = max(oldest, self._box[Box.HEAD] - self.spec.depth + SPARE_SLOTS)
         self.superseded += serial - oldest
         self._box[Box.TAKEN] = serial
         return self._fetch_good(serial)

@@ -176,8 +176,7 @@ def _merge_arrivals(sources: Sequence[InterruptSource], since_ns: int) -> Iterat
 
     Each is the time of arrival and the service time of a message.
     """
-    arrivals = (_iterate_arrivals(source, since_ns) for source in sources)
-    return merge(*arrivals, key=itemgetter(0))
+    return merge(*(_iterate_arrivals(source, since_ns) for source in sources), key=itemgetter(0))
 
 
 def _iterate_arrivals(source: InterruptSource, since_ns: int) -> Iterator[tuple[int, int]]:

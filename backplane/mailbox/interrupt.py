@@ -84,10 +84,7 @@ class InterruptLine:
         """Number of messages of this mailbox lost at this board because too many waited."""
         self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
         """Serials of the last few messages served."""
-        self._slots = slots = Slots(segment, spec)
-        self._box = slots.box
-        self._heads = slots.heads
-        self._mask = slots.mask
+        self._slots = Slots(segment, spec)
         self._clock_ns = segment.layout.clock_ns
         self._sent_ns = compute_send_offset_ns(spec, self._clock_ns)
         self._passed = self._signature = self._missing = self._suspect = 0
@@ -99,8 +96,7 @@ class InterruptLine:
 
         It belongs to a served message, to a slot that was never filled, or to a forged message.
         """
-        served = self.served
-        return max(served[-1] if served else 0, self._missing, self._suspect)
+        return max(self.served[-1] if self.served else 0, self._missing, self._suspect)
 
     def collect_arrivals(
         self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]
@@ -112,17 +108,16 @@ class InterruptLine:
             number: Index of this line among the board's lines, stored with each arrival.
             arrivals: List of (time of arrival, index of the line, serial) to extend.
         """
-        head = self._box[0]
-        heads = self._heads
-        mask = self._mask
+        slots = self._slots
+        head = slots.box[0]
         serial = self._passed + 1
         self._suspect = 0
         if serial > head:
             return
-        self._slots.fence()
-        serial = max(serial, compute_oldest_intact(head, self._slots.depth))
+        slots.fence()
+        serial = max(serial, compute_oldest_intact(head, slots.depth))
         while serial <= head:
-            words = heads[serial & mask]
+            words = slots.heads[serial & slots.mask]
             if words[Slot.SERIAL] != serial:
                 # The slot was never filled, so the message raises no interrupt.
                 self._missing = serial

@@ -390,8 +390,7 @@ class Reader:
         """Count a read that timed out. Returns the last good message with verdict BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
-        verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
-        return self._readings[verdict]
+        return self._readings[Verdict.BUS_ERROR if self.serial else Verdict.NONE]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
         """Return a copy of `reading` whose `earlier` contains the messages that the read skipped.

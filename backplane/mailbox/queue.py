@@ -142,11 +142,9 @@ class QueueWriter(Writer):
         """
         if not self._pending:
             return True
-        if basis is None:
-            basis = tick
         visible_at = self.compute_visible_tick(tick, now)
         for _ in self.iterate_outgoing():
-            self.slots.publish_message(tick, visible_at, basis)
+            self.slots.publish_message(tick, visible_at, tick if basis is None else basis)
         self.show_published()
         return self.is_in_time(tick, now)
 
@@ -277,9 +275,8 @@ class QueueReader(Reader):
         while self._can_take(newest + 1, last, tick):
             newest += 1
         box[Box.POSITION] = 3 * self.taken
-        position = self._position
-        _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
-        position.write(tick, now)
+        _PUT_POSITION(self._position.message.raw, 0, self.taken, newest - self.taken)
+        self._position.write(tick, now)
         if not count:
             return self._unchanged
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new

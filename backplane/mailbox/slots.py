@@ -128,7 +128,6 @@ class Slots:
     ) -> None:
         self.spec = spec
         dtype = build_message_dtype(spec.fields, spec.size)
-        address = segment.map.mailboxes[spec.name]
         stride = compute_slot_stride(spec)
         self.box = segment.get_box(spec.name)
         self.depth = spec.depth
@@ -136,7 +135,7 @@ class Slots:
         self.record = record or memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
         kind: Any = segment.message_classes.get(spec.name, AnyMessage)
         self.message: AnyMessage = kind(dtype, self.record[SLOT_HEAD_SIZE:])
-        first = address + MAILBOX_HEAD_SIZE
+        first = segment.map.mailboxes[spec.name] + MAILBOX_HEAD_SIZE
         self.places = [
             segment.get_bytes(first + i * stride, len(self.record)) for i in range(spec.depth)
         ]

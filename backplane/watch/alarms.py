@@ -150,10 +150,8 @@ class AlarmWriter:
     def __init__(self, segment: Segment, task: str, attention: int | None = None) -> None:
         address = segment.map.alarms[task]
         self._head = segment.words[address // 8 : address // 8 + 1]
-        first = address + CACHE_LINE
-        self._slots = np.frombuffer(
-            segment.get_bytes(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD
-        )
+        memory = segment.get_bytes(address + CACHE_LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
+        self._slots = np.frombuffer(memory, dtype=RECORD)
         self._attention = attention
 
     def raise_alarm(
@@ -176,14 +174,13 @@ class AlarmWriter:
             text: A level's description of its finding.
         """
         count = self._head[0] + 1
-        since_tick = tick if since is None else since
         self._slots[count % ALARM_DEPTH] = (
             tick,
             monotonic_ns(),
             code,
             subject,
             value,
-            since_tick,
+            tick if since is None else since,
             text.encode("utf-8", "replace"),
         )
         self._head[0] = count

@@ -49,7 +49,7 @@ class MessageWatch:
         writer = reader.spec.writer
         copies = segment.layout.list_copies(writer)
         self._records = [CycleRecord(segment, copy.name) for copy in copies]
-        self._blocks = segment.get_copy_blocks(writer)
+        self._blocks = [segment.get_block(copy.name) for copy in copies]
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_tick_based
         # A message that is visible at once carries the tick at which it was written.
@@ -60,11 +60,6 @@ class MessageWatch:
     def _active(self) -> int:
         """Number of the copy that writes, if the writer has standbys. 0 otherwise."""
         return self._blocks[0][Block.ACTIVE] % len(self._blocks)
-
-    @property
-    def _cycles(self) -> CycleRecord:
-        """Record of the writer's cycles."""
-        return self._records[self._active]
 
     def check_messages(self, tick: int) -> None:
         """Check the messages that have become visible up to the read at `tick`."""
@@ -83,16 +78,9 @@ class MessageWatch:
     def _start_after(self, serial: int) -> None:
         """Skip the messages up to a serial. Checks continue with the message after it."""
         self.seen = serial
-        if serial and self._copy_message(serial):
-            self.newest = self._slots.tick
-
-    def _copy_message(self, serial: int) -> bool:
-        """Copy the message with a serial into the local record of the slots.
-
-        Returns:
-            False if the message is missing, damaged, or possibly overwritten during the copy.
-        """
-        return self._slots.fetch_message(serial) and self._slots.is_intact(serial)
+        slots = self._slots
+        if serial and slots.fetch_message(serial) and slots.is_intact(serial):
+            self.newest = slots.tick
 
     def _is_babble(self, newest_serial: int, tick: int) -> bool:
         """Check whether the writer has sent at least two messages more than its releases allow.
@@ -108,7 +96,7 @@ class MessageWatch:
             # The message is already overwritten. A writer that sends one message per cycle would
             # be too slow for that. Use the newest message instead.
             newest_serial = slots.box[0]
-        if not self._copy_message(newest_serial):
+        if not slots.fetch_message(newest_serial) or not slots.is_intact(newest_serial):
             return False
         count = newest_serial - self.seen
         cycles = (slots.tick - self.newest) // self._spec.every
@@ -126,8 +114,6 @@ class MessageWatch:
         """
         slots = self._slots
         mask = slots.mask
-        taken = self._reader.serial
-        late = self.late_from
         # Messages that are already overwritten, because the reader is late, cannot be checked.
         for serial in range(
             max(self.seen + 1, compute_oldest_intact(slots.box[0], slots.depth)), newest_serial + 1
@@ -137,9 +123,9 @@ class MessageWatch:
             # The reader has verified the checksum of the message that it took, but of no other.
             if (
                 head[Slot.SERIAL] == serial
-                and self.newest < released > head[Slot.VISIBLE_AT] - late
+                and self.newest < released > head[Slot.VISIBLE_AT] - self.late_from
                 and (
-                    serial == taken
+                    serial == self._reader.serial
                     or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
                     == (head[Slot.CHECK] & UNSIGNED) ^ get_epoch(head[Slot.EPOCH])
                 )
@@ -190,7 +176,7 @@ class MessageWatch:
         elif visible - released >= self.late_from:
             # A message published after the end of its cycle was held back. Otherwise the cycle was
             # just late.
-            ended_ns = self._cycles.find_end_ns(released)
+            ended_ns = self._records[self._active].find_end_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
                 self._record_finding(
                     Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released

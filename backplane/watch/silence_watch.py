@@ -126,24 +126,24 @@ class SilenceWatch(MessageWatch):
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a cycle without writing the message due in it."""
-        accesses = self._reader.accesses
         if any(
-            self._episodes.is_open(code, accesses, tick)
+            self._episodes.is_open(code, self._reader.accesses, tick)
             for code in (Alarm.HELD_BACK, Alarm.DISORDER)
         ):
             # The writer is not mute: it sends messages, but they are late or out of order.
             return False
         # Read the finished tick before the newest serial, because a writer publishes a message
         # before it reports its cycle as finished.
-        finished = self._cycles.finished_tick
+        cycles = self._records[self._active]
+        finished = cycles.finished_tick
         slots = self._slots
         head = slots.box[0]
         # If the slot of the newest serial is not filled, the writer is not mute: the message was
         # written and lost.
         spec = self._reader.spec
-        due = finished - (finished + spec.lead_ticks - spec.phase) % spec.every
+        due = finished - (finished + spec.due_offset) % spec.every
         # The writer may not have run that cycle, because it was dead, late or not released.
-        if self._cycles.find_end_ns(due) is None:
+        if cycles.find_end_ns(due) is None:
             return False
         return slots.copy_slot(head) and slots.serial == head and slots.tick < due
 

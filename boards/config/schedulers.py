@@ -6,7 +6,7 @@ from typing import get_args
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.process import Reservation
-from rack.backplane.words import Scheduler
+from rack.backplane.words import SCHEDULERS, Scheduler
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.schema import RackConfig, SchedulerName, TaskEntry
 from rack.boards.errors import Mistake, Mistakes
@@ -35,7 +35,7 @@ def list_valid_schedulers(config: RackConfig) -> tuple[str, ...]:
 def find_scheduler(config: RackConfig, board: str) -> Scheduler:
     """Return the scheduler of a board's executor at the launch."""
     word = config.board[board].scheduler or config.clock.scheduler or "fixed-priority"
-    return Scheduler.find(word)
+    return SCHEDULERS[word]
 
 
 def find_clock_scheduler(config: RackConfig) -> Scheduler:

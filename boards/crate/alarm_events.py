@@ -187,18 +187,11 @@ class AlarmReader:
             if ring.waiting_count:
                 rows, lost = ring.read_new_rows()
                 self.lost += lost
-                alarms += [
-                    ReadAlarm(
-                        to_enum(Alarm, row["code"]),
-                        int(row["subject"]),
-                        self.build_event(row, owner),
-                    )
-                    for row in rows
-                ]
+                alarms += [self.read_row(row, owner) for row in rows]
         return sorted(alarms, key=lambda alarm: (alarm.event.tick, alarm.event.time_ns))
 
-    def build_event(self, row: np.void, owner: str) -> Event:
-        """Convert an alarm to an event.
+    def read_row(self, row: np.void, owner: str) -> ReadAlarm:
+        """Convert a row of an alarm ring, and describe the alarm as an event.
 
         `Event.board` is the board that raised the alarm, or for a fault, restart or command, the
         board that it affects.
@@ -278,7 +271,7 @@ class AlarmReader:
             # event gets the tick at which they engaged.
             tick = since
             text += f", known at tick {found_at}"
-        return Event(
+        event = Event(
             time_ns=int(row["time_ns"]) + time.time_ns() - time.monotonic_ns(),
             tick=tick,
             kind=kind,
@@ -290,6 +283,7 @@ class AlarmReader:
             value=value,
             since=since,
         )
+        return ReadAlarm(alarm, number, event)
 
     def _describe_details(self, alarm: Alarm, about: str, row: np.void) -> dict[str, object]:
         """Return further words for the text of an alarm, by name.

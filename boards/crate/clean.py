@@ -30,8 +30,6 @@ def remove_dead_rack(rack: str) -> bool:
         RackInUseError: The launcher of the rack is alive.
         SegmentError: The segment belongs to another user or is not a file.
     """
-    if rack not in list_racks():
-        return False
     with suppress(FileNotFoundError):
         # A file that is too short for a head is not in use, because a launch names its segment only
         # when the segment is complete.

@@ -15,12 +15,12 @@ import gc
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from socket import socket
+from time import monotonic, monotonic_ns
 
 from rack.backplane.address_map import CLOCK_STANDBY
 from rack.backplane.copies import restore_memory
@@ -44,7 +44,6 @@ from rack.boards.crate.requests import (
     Forked,
     ForkFailed,
     Leave,
-    Left,
     Open,
     Opened,
     PowerOff,
@@ -55,7 +54,7 @@ from rack.boards.crate.requests import (
     Show,
     Shown,
 )
-from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
+from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy, Wiring
 from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.faults.tasks import run_core_fault
 from rack.boards.run.board import run_board, run_clock_board, run_task_board
@@ -68,8 +67,6 @@ from rack.levels.references import find_class
 
 Source = Connection | socket | int
 """Object whose readiness the crate can wait for."""
-HOST_BOARD = "rack.boards.host.board"
-"""Module that runs host programs. It is imported only in the processes of host boards."""
 HOST_PROCESSES = 4
 """Number of processes that are not in the layout: Rack, crate, clock and recorder."""
 OUTPUT_PAUSE_S = 0.01
@@ -96,7 +93,7 @@ class Crate:
         # Name and process id of each board, by pidfd.
         self._boards: dict[int, tuple[str, int]] = {}
         self._shelf = SnapshotShelf()
-        self._wirings: dict[str, TaskWiring | ClockWiring] = {}
+        self._wirings: dict[str, Wiring] = {}
         self._copies_to_continue: dict[str, WaitingCopy] = {}
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
@@ -120,12 +117,11 @@ class Crate:
             printing = [
                 output for output in self._outputs.values() if output not in self._paused_outputs
             ]
-            readers = [output.reader for output in printing]
             ready = self._reap_ended(
                 OUTPUT_PAUSE_S if self._paused_outputs else None,
                 self._line,
                 self._launcher,
-                *readers,
+                *(output.reader for output in printing),
             )
             if not ready:
                 self._paused_outputs.clear()
@@ -161,7 +157,9 @@ class Crate:
                 # Import the module in the forked process, so that the crate stays small.
                 self._fork_board(
                     name,
-                    lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
+                    lambda segment: import_module("rack.boards.host.board").run_host_board(
+                        segment, host, *lines
+                    ),
                 )
             case PowerOn(name, int() as entry):
                 self._fork_board(name, lambda segment: run_core_fault(segment, entry))
@@ -171,7 +169,7 @@ class Crate:
                 self._leave_rack()
                 # If the Rack is gone, `run` detects that on its next pass.
                 with suppress(OSError):
-                    self._line.send(Left())
+                    self._line.send(request)
             case Show(tick, name):
                 snapshot = self._shelf.find_nearest(tick)
                 text = (
@@ -195,7 +193,7 @@ class Crate:
             self._publish_snapshots()
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
-    def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
+    def _power_on(self, name: str, wiring: Wiring) -> None:
         """Start a task or the clock.
 
         If the snapshot contains a copy that can continue with this wiring, it continues. Otherwise
@@ -251,8 +249,8 @@ class Crate:
                     if issubclass(kind, Executor | Planner):
                         kind.preload()
                 except Exception as error:
-                    reason = to_one_line(f"{type(error).__name__}: {error}", MAX_REASON_LENGTH)
-                    self._line.send(PreloadFailed(reference, reason))
+                    text = f"{type(error).__name__}: {error}"
+                    self._line.send(PreloadFailed(reference, to_one_line(text, MAX_REASON_LENGTH)))
                     return
                 self._preloaded.add(reference)
         if request.cell is not None:
@@ -287,7 +285,7 @@ class Crate:
 
     def _report_fork_failure(self, name: str, why: str) -> None:
         """Mark a board that could not be forked as lost, and report it to the Rack."""
-        end = Ended(name, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
+        end = Ended(name, os.EX_OSERR, monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
 
@@ -304,8 +302,8 @@ class Crate:
 
         They have become children of the crate.
         """
-        deadline = time.monotonic() + ORPHANS_S
-        while time.monotonic() < deadline:
+        deadline = monotonic() + ORPHANS_S
+        while monotonic() < deadline:
             boards = {pid for _, pid in self._boards.values()}
             orphans = list_children(os.getpid()) - boards - self._shelf.pids
             if not orphans:
@@ -358,12 +356,12 @@ class Crate:
 
     def _leave_rack(self) -> None:
         """Wait for the boards of the present rack to end, kill those that do not, and detach."""
-        deadline = time.monotonic() + LEAVE_S
+        deadline = monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
                 # A host program may block without a time limit, and only a signal can interrupt it.
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
-        while self._boards and (left := deadline - time.monotonic()) > 0:
+        while self._boards and (left := deadline - monotonic()) > 0:
             self._reap_ended(left)
         self._kill_boards()
         while self._boards:
@@ -400,7 +398,7 @@ class Crate:
         """
         ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
         for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
-            seen_ns = time.monotonic_ns()
+            seen_ns = monotonic_ns()
             name, pid = self._boards.pop(pidfd)
             tick = self._mark_lost(name)
             os.close(pidfd)

@@ -40,12 +40,9 @@ class Heartbeat:
         self._words = segment.words
         watched = segment.layout.tasks if self._words[System.LOCKSTEP] else ()
         self._blocks = {task.name: segment.get_block(task.name) for task in watched}
-        bound_s = max(LEAST_S, HEARTBEATS_MISSED * self._words[System.PERIOD_NS] * 1e-9)
-        self._bounds = {
-            **dict.fromkeys(self._blocks, LOCKSTEP_S),
-            CLOCK: LOCKSTEP_S if watched else bound_s,
-        }
-        self._seen = {name: (-1, time.monotonic()) for name in self._bounds}
+        heartbeats_s = HEARTBEATS_MISSED * self._words[System.PERIOD_NS] * 1e-9
+        self._bound_s = LOCKSTEP_S if watched else max(LEAST_S, heartbeats_s)
+        self._seen = {name: (-1, time.monotonic()) for name in (*self._blocks, CLOCK)}
         self._reported: set[str] = set()
         # Processor time of each task when its count began, in ns.
         self._used_ns: dict[str, int] = {}
@@ -89,14 +86,14 @@ class Heartbeat:
     def _is_hanging(self, name: str, silent_s: float) -> bool:
         """Return True if a process that has made no progress for `silent_s` is hanging."""
         if name == CLOCK:
-            return silent_s > self._bounds[name] and self._is_clock_stuck()
+            return silent_s > self._bound_s and self._is_clock_stuck()
         if silent_s < COMPUTING_S:
             return False
         pid = self._blocks[name][Block.PID]
         used_ns = read_processor_ns(pid)
         used_ns -= self._used_ns.setdefault(name, used_ns)
         is_computing = read_state(pid) not in WAITING_STATES + STOPPED_STATES + ENDED_STATES
-        return (used_ns * 1e-9 if is_computing else silent_s) > self._bounds[name]
+        return (used_ns * 1e-9 if is_computing else silent_s) > self._bound_s
 
     def _is_clock_stuck(self) -> bool:
         """Return True if the clock's process is stopped or dead, or still waits at the same tick.

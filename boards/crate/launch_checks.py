@@ -6,12 +6,7 @@ from collections.abc import Iterator
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 
 from rack.backplane import exclusive_cores
-from rack.backplane.process import (
-    DEADLINE,
-    keep_cores_awake,
-    read_memory_sizes,
-    reserve_time,
-)
+from rack.backplane.process import DEADLINE, keep_cores_awake, read_memory_sizes, reserve_time
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Scheduler, System
 from rack.boards.config.layout import list_replaced_cores

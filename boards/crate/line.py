@@ -19,14 +19,18 @@ from typing import Self
 
 from rack.backplane.process import wait_readable
 from rack.boards.crate.output import split_lines
-from rack.boards.crate.requests import Leave, Left, Show, Shown
+from rack.boards.crate.requests import Leave, Show, Shown
 from rack.boards.errors import LaunchError
 
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Settings that keep numerical libraries single-threaded.
-
-The crate must have no threads when it forks, and a board has only one core.
-"""
+LIBRARIES = {
+    # The crate must have no threads when it forks, and a board has only one core.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    # MuJoCo must not start a process that looks for OpenGL. Boards do not draw.
+    "MUJOCO_GL": "disable",
+}
+"""Settings of libraries in the environment of a crate."""
 TUNABLES = "GLIBC_TUNABLES"
 SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
 """Setting that makes the mathematical functions of the C library independent of the processor.
@@ -40,8 +44,6 @@ END_S = 1.0
 """Time that a crate has to end its snapshots and itself before it is killed."""
 LEAVE_S = 10.0
 """Longest wait until a crate has left a rack. The crate may still be importing modules."""
-NO_WINDOWS = {"MUJOCO_GL": "disable"}
-"""Setting that stops MuJoCo from starting a process that looks for OpenGL. Boards do not draw."""
 
 
 class CrateLine:
@@ -79,7 +81,7 @@ class CrateLine:
             env=build_environment(),
         )
         crate_end.close()
-        self._is_closed = False
+        self.is_over = False
 
     def __enter__(self) -> Self:
         return self
@@ -98,19 +100,23 @@ class CrateLine:
         Returns:
             The lines. Empty once the crate has been ended.
         """
-        if self._is_closed:
+        if self.is_over:
             return []
         data = os.pread(self._printed, 1 << 20, self._read_to)
         lines = split_lines(data)
         self._read_to += sum(map(len, lines))
         return [text for line in lines for text in line.decode(errors="replace").splitlines()]
 
+    def build_error(self, otherwise: str) -> LaunchError:
+        """Build an error with the last output of the boards, or `otherwise` if there is none."""
+        return LaunchError("\n".join(self.read_output()) or otherwise)
+
     def send_request(self, request: object) -> None:
         """Send a request. If the crate has ended, raise `LaunchError` with its last output."""
         try:
             self.line.send(request)
         except OSError:
-            raise LaunchError("\n".join(self.read_output()) or "the crate has ended") from None
+            raise self.build_error("the crate has ended") from None
 
     def try_request(self, request: object) -> None:
         """Send a request to the crate. Do nothing if the crate has ended.
@@ -130,9 +136,9 @@ class CrateLine:
         Args:
             timeout_s: Time in s after which the crate is killed.
         """
-        if self._is_closed:
+        if self.is_over:
             return
-        self._is_closed = True
+        self.is_over = True
         self.line.close()
         # `Popen.wait` with a time-out sleeps in steps of up to 50 ms, which delays every end.
         ended = os.pidfd_open(self._process.pid)
@@ -154,17 +160,10 @@ class WarmCrate(CrateLine):
         is_last: Whether the crate ends when its present rack is closed.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.is_last = False
+    is_last = False
 
     def __exit__(self, *error: object) -> None:
         self.end_crate()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the crate was ended, on request or because leaving a rack took too long."""
-        return self._is_closed
 
     def close(self, timeout_s: float) -> None:
         """Make the crate end the boards of its rack, and wait until they have ended.
@@ -175,7 +174,7 @@ class WarmCrate(CrateLine):
             timeout_s: Time in s after which the crate is killed if it does not end. Used only if
                 `is_last` is set.
         """
-        if self._is_closed:
+        if self.is_over:
             return
         if self.is_last:
             super().close(timeout_s)
@@ -185,7 +184,7 @@ class WarmCrate(CrateLine):
         answer: object = self
         while answer is not None and self.line.poll(max(0.0, deadline - time.monotonic())):
             answer = self.receive_message()
-            if isinstance(answer, Left):
+            if isinstance(answer, Leave):
                 self.read_output()
                 with suppress(BlockingIOError):
                     os.eventfd_read(self.attention)
@@ -204,9 +203,8 @@ class WarmCrate(CrateLine):
             snapshot.
         """
         self.try_request(Show(tick, task))
-        answer: object = self
-        while answer is not None and not isinstance(answer, Shown):
-            answer = self.receive_message()
+        while not isinstance(answer := self.receive_message(), Shown | None):
+            continue
         return answer or Shown(-1, "")
 
     def end_crate(self) -> None:
@@ -219,12 +217,10 @@ def build_environment() -> dict[str, str]:
 
     It is the environment of this process, with settings that make runs repeat exactly.
     """
-    tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {
         **os.environ,
-        **ONE_THREAD,
-        **NO_WINDOWS,
-        TUNABLES: tunables,
+        **LIBRARIES,
+        TUNABLES: ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM))),
         "PYTHONPATH": os.pathsep.join(sys.path),
     }
 

@@ -7,6 +7,7 @@ in lockstep and tasks with ordinary priority do not occupy a core, because they 
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -86,17 +87,17 @@ def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
 
 def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
     """Return a dictionary from core to the real-time tasks of a running rack on that core."""
+    occupied: defaultdict[int, list[str]] = defaultdict(list)
     if segment.words[System.STATE] == Run.STOPPED:
-        return {}
-    occupied: dict[int, list[str]] = {}
+        return occupied
     for task in segment.layout.tasks:
         if segment.get_block(task.name)[Block.PRIORITY]:
-            occupied.setdefault(task.core, []).append(task.name)
+            occupied[task.core].append(task.name)
     # The config is not validated: another version of this program may have created the segment.
     clock = load_toml(segment.config).get("clock", {})
     # If the boards have their priorities, the clock has its priority too.
     if occupied and clock.get("priority"):
-        occupied.setdefault(find_core(clock["core"]), []).append(CLOCK)
+        occupied[find_core(clock["core"])].append(CLOCK)
     return occupied
 
 
@@ -127,15 +128,15 @@ def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackCon
 
 def find_conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     """Return a line for each core that real-time tasks of this config share with another rack."""
-    tasks = [
-        (CLOCK, config.clock.core, config.clock.priority),
-        *((t.name, t.core, t.priority) for t in (*config.list_tasks(), *config.list_standbys())),
-    ]
-    requested: dict[int, list[str]] = {}
-    for task, core, priority in tasks:
-        if priority:
-            requested.setdefault(find_core(core), []).append(task)
-    both = () if config.is_lockstep else sorted(requested.keys() & held.keys())
+    if config.is_lockstep:
+        return []
+    requested: defaultdict[int, list[str]] = defaultdict(list)
+    if config.clock.priority:
+        requested[find_core(config.clock.core)].append(CLOCK)
+    for task in (*config.list_tasks(), *config.list_standbys()):
+        if task.priority:
+            requested[find_core(task.core)].append(task.name)
     return [
-        f"core {core}, requested by {', '.join(requested[core])}: {held[core]}" for core in both
+        f"core {core}, requested by {', '.join(requested[core])}: {held[core]}"
+        for core in sorted(requested.keys() & held.keys())
     ]

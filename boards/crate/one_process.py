@@ -51,11 +51,13 @@ class OneProcess:
             for spec in plan.layout.mailboxes
             if spec.exchanges or spec.capacity or spec.interrupt is not None
         ]:
-            why = "a queue, an exchange or interrupts, which only a rack with boards has"
-            raise LaunchError(f"{', '.join(boards)}: {why}")
+            raise LaunchError(
+                f"{', '.join(boards)}: a queue, an exchange or interrupts, which only a rack with"
+                " boards has"
+            )
         if plan.hosts:
-            names = ", ".join(host.board for host in plan.hosts)
-            raise LaunchError(f"{names}: a host board, which needs a separate process")
+            names = [host.board for host in plan.hosts]
+            raise LaunchError(f"{', '.join(names)}: a host board, which needs a separate process")
         self.tick = 0
         self._clock_ns = plan.layout.clock_ns
         self._mailboxes = {spec.name: PrivateMailbox(spec) for spec in plan.layout.mailboxes}
@@ -201,8 +203,7 @@ class PrivateTask:
     ) -> None:
         self.spec = layout.find_task(wiring.task)
         kind: type[Executor] | type[Planner] = find_class(
-            wiring.target,
-            Executor if self.spec.role == "executor" else Planner,
+            wiring.target, Executor if self.spec.role == "executor" else Planner
         )
         kind.preload()
         self.level = level = kind(wiring.context)

@@ -62,9 +62,8 @@ class HostOutput:
             os.write(1, b"".join(line.rstrip(b"\n") + b"\n" for line in first_lines))
         if self._lines >= self._next or (is_over and self._lines > MOST_LINES):
             self._next = 2 * self._lines
-            dropped = self._lines - MOST_LINES
             text = (
-                f"host board '{self._board}': {dropped} lines dropped so far; a run keeps the first"
-                f" {MOST_LINES}\n"
+                f"host board '{self._board}': {self._lines - MOST_LINES} lines dropped so far; a"
+                f" run keeps the first {MOST_LINES}\n"
             )
             os.write(1, text.encode())

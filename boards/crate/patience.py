@@ -110,7 +110,5 @@ def await_open_segment(crate: CrateLine, journal: Journal, limit_s: float) -> in
             case PreloadFailed(kind, why):
                 raise LaunchError(f"'{kind}' cannot be preloaded: {why}")
             case None:
-                raise LaunchError("\n".join(crate.read_output()) or "the crate has ended")
-    raise LaunchError(
-        "\n".join(crate.read_output()) or f"{doing}: not done within {patience.limit_s:g} s"
-    )
+                raise crate.build_error("the crate has ended")
+    raise crate.build_error(f"{doing}: not done within {patience.limit_s:g} s")

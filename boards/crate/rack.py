@@ -348,8 +348,10 @@ class Rack:
         try:
             if (launched := self._launched) is not None:
                 launched.end_boards()
-                tasks = launched.plan.layout.tasks
-                is_any_lost = any(self.segment.get_block(task.name)[Block.LOST] for task in tasks)
+                is_any_lost = any(
+                    self.segment.get_block(task.name)[Block.LOST]
+                    for task in launched.plan.layout.tasks
+                )
                 if is_any_lost or launched.recovery.given_up:
                     crate.try_request(PowerOff())
                 # A crate without boards may still be importing, so do not wait for it.
@@ -371,7 +373,7 @@ class Rack:
 
 def build_preload_request(config: RackConfig) -> Preload:
     """Return the request to import and preload the levels of a rack and to compile its cell."""
-    robot, scene = config.robot, config.scene
-    cell = None if robot is None else CellConfig(robot, scene, config.clock_ns)
-    classes = tuple(dict.fromkeys(task.target for task in config.list_tasks()))
-    return Preload(classes, tuple(sys.path), cell)
+    robot = config.robot
+    cell = None if robot is None else CellConfig(robot, config.scene, config.clock_ns)
+    classes = dict.fromkeys(task.target for task in config.list_tasks())
+    return Preload(tuple(classes), tuple(sys.path), cell)

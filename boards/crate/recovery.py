@@ -47,9 +47,9 @@ class RestartPolicy:
                 for other in layout.tasks
                 if other.board in below and other.role != "standby"
             }
-            self._needs[task.name] = {CLOCK, *needed} | (
-                {task.board} if task.role == "planner" else set()
-            )
+            self._needs[task.name] = {CLOCK, *needed}
+            if task.role == "planner":
+                self._needs[task.name].add(task.board)
 
     def admit_restart(self, task: str, tick: int) -> str:
         """Decide whether a task that was lost at `tick` may be restarted, and if so, count it.
@@ -80,8 +80,7 @@ class RestartPolicy:
             waiting: Absent tasks that are to be restarted.
             starting: Absent tasks that are being restarted.
         """
-        absent = {*waiting, *starting}
-        return [task for task in waiting if self._needs[task].isdisjoint(absent)]
+        return [task for task in waiting if self._needs[task].isdisjoint((*waiting, *starting))]
 
 
 class Recovery:
@@ -180,8 +179,9 @@ class Recovery:
             board: Name of the board.
             why: Text to append to the event, as in ": stopped by a signal". May be empty.
         """
-        text = f"'{board}' is not responding{why}"
-        self._journal.add_event("detection", "rack", text, "hang", subject=board)
+        self._journal.add_event(
+            "detection", "rack", f"'{board}' is not responding{why}", "hang", subject=board
+        )
 
     def kill_hanging(self, board: str) -> None:
         """Kill a hanging board, which is then handled as lost. Skip one that is being restarted."""

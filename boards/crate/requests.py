@@ -6,16 +6,14 @@ config are loaded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
     from rack.levels.tables import RobotConfig, SceneConfig
 
 
-@dataclass(frozen=True)
-class CellConfig:
+class CellConfig(NamedTuple):
     """Tables of a config from which the cell is compiled."""
 
     robot: RobotConfig
@@ -23,8 +21,7 @@ class CellConfig:
     clock_ns: int
 
 
-@dataclass(frozen=True)
-class Preload:
+class Preload(NamedTuple):
     """Request to import and preload levels, which the boards forked later then share.
 
     Attributes:
@@ -38,8 +35,7 @@ class Preload:
     cell: CellConfig | None = None
 
 
-@dataclass(frozen=True)
-class Open:
+class Open(NamedTuple):
     """Request to attach to the segment of a rack.
 
     Attributes:
@@ -54,8 +50,7 @@ class Open:
     before: int | None = None
 
 
-@dataclass(frozen=True)
-class PowerOn:
+class PowerOn(NamedTuple):
     """Request to fork one process: a task, the clock, a host board or a hog.
 
     The wiring of a hog, which occupies a core, is the index of its fault in the fault table.
@@ -68,66 +63,56 @@ class PowerOn:
     wiring: TaskWiring | ClockWiring | HostWiring | int
 
 
-@dataclass(frozen=True)
-class PowerOff:
+class PowerOff(NamedTuple):
     """Request to kill one board. Without a name, every board that is still running is killed."""
 
     name: str | None = None
 
 
-@dataclass(frozen=True)
-class Leave:
-    """Request to end the boards of this rack and wait for requests of another rack."""
+class Leave(NamedTuple):
+    """Request to end the boards of this rack and wait for requests of another rack.
+
+    The crate sends it back when all boards have ended.
+    """
 
 
-@dataclass(frozen=True)
-class Left:
-    """Answer to `Leave`: all boards of the rack have ended."""
-
-
-@dataclass(frozen=True)
-class Preloading:
+class Preloading(NamedTuple):
     """Report that the crate begins to preload a class."""
 
     kind: str
 
 
-@dataclass(frozen=True)
-class Compiling:
+class Compiling(NamedTuple):
     """Report that the crate begins to compile a function that no earlier launch has compiled."""
 
     function: str
 
 
-@dataclass(frozen=True)
-class PreloadFailed:
+class PreloadFailed(NamedTuple):
     """Report that preloading a class failed, so that no board can be forked."""
 
     kind: str
     error: str
 
 
-@dataclass(frozen=True)
-class Opened:
+class Opened(NamedTuple):
     """Answer to `Open`.
 
     Attributes:
         tick: Tick of the snapshot from which the rack continues. -1 without one.
     """
 
-    tick: int = -1
+    tick: int
 
 
-@dataclass(frozen=True)
-class Show:
+class Show(NamedTuple):
     """Request for the attributes of a task's level in the last snapshot at or before a tick."""
 
     tick: int
     task: str
 
 
-@dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """Answer to `Show`.
 
     Attributes:
@@ -139,16 +124,14 @@ class Shown:
     attributes: str
 
 
-@dataclass(frozen=True)
-class Forked:
+class Forked(NamedTuple):
     """Report that a board was forked."""
 
     name: str
     pid: int
 
 
-@dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     """Report that the process of a board has ended.
 
     Attributes:
@@ -164,8 +147,7 @@ class Ended:
     tick: int
 
 
-@dataclass(frozen=True)
-class ForkFailed:
+class ForkFailed(NamedTuple):
     """Report that a board could not be forked: a record of its end, and the reason."""
 
     end: Ended

@@ -123,8 +123,8 @@ class HeldSnapshot:
 
 def _read_size(file: str, key: str) -> int:
     """Return the size in bytes that a file of /proc states, in kB, under a key."""
-    text = Path("/proc", file).read_text()
-    return sum(int(kib) << 10 for kib in re.findall(rf"{key}: +(\d+)", text))
+    sizes_kib = re.findall(rf"{key}: +(\d+)", Path("/proc", file).read_text())
+    return sum(map(int, sizes_kib)) << 10
 
 
 class SnapshotShelf:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import time
 from contextlib import suppress
 from multiprocessing.connection import wait
+from time import monotonic
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import select_item
@@ -86,8 +86,7 @@ class Supervisor:
         ]:
             self._wait_for_messages(patience.left_s)
             if self.recovery.faults:
-                printed = self._crate.read_output()
-                raise LaunchError("\n".join(printed) or self.recovery.faults[0])
+                raise self._crate.build_error(self.recovery.faults[0])
             if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {limit_s:g} s")
             patience.report_if_due(f"boards {', '.join(absent)} are starting")
@@ -97,11 +96,11 @@ class Supervisor:
 
         If the rack is held, return after the next message or alarm.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = monotonic() + timeout_s
         while self.outcome is None:
-            self._wait_for_messages(min(deadline, self._stop_by or deadline) - time.monotonic())
+            self._wait_for_messages(min(deadline, self._stop_by or deadline) - monotonic())
             if self._why_stopped and self._stop_by is None:
-                self._stop_by = time.monotonic() + STOP_S
+                self._stop_by = monotonic() + STOP_S
                 self._journal.add_event("stop", "", self._why_stopped)
             self._record_printed()
             for raised in self.alarms.read_alarms():
@@ -116,10 +115,10 @@ class Supervisor:
             self.recovery.restart_due_boards()
             if not self.is_armed:
                 self.reset_latch()
-            is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
+            is_late = self._stop_by is not None and monotonic() >= self._stop_by
             if self._is_stopped or self.recovery.is_beyond_help or is_late:
                 self._end_run()
-            if time.monotonic() >= deadline or self.segment.words[System.HELD]:
+            if monotonic() >= deadline or self.segment.words[System.HELD]:
                 break
         return self.outcome is None
 
@@ -138,8 +137,10 @@ class Supervisor:
             self._kill_clock(raised.subject)
         elif raised.alarm == Alarm.DIFFERS:
             board = self.plan.layout.find_task(raised.event.board).board
-            words = self.segment.words
-            is_disturbed = words[System.INJECTED] or self.segment.get_block(board)[Block.HAND_OVERS]
+            is_disturbed = (
+                self.segment.words[System.INJECTED]
+                or self.segment.get_block(board)[Block.HAND_OVERS]
+            )
             is_early = raised.event.tick * self.plan.layout.clock_ns < EARLY_NS
             if is_early and not is_disturbed:
                 why = f"the level is not deterministic: {raised.event.text}, at the start"

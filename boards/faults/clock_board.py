@@ -28,7 +28,6 @@ from rack.boards.faults.describe import find_board
 from rack.boards.faults.kind import find_kind
 from rack.boards.faults.message_steps import Babble, forge_message
 
-OPEN_STAGES = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
 """Number of phases in a tick: a phase of 500 is the middle of the tick."""
 REPORTED_TICKS = 0.5
@@ -243,7 +242,7 @@ class FaultStage:
         Also report the mailboxes that have a new message after a fault.
         """
         self.injected = self._words[System.INJECTED]
-        faults = self._table.list_entries(OPEN_STAGES)
+        faults = self._table.list_entries((Stage.WAITING, Stage.ACTIVE))
         over = [e for e in faults if e.stage == Stage.ACTIVE and self._is_over(e, tick)]
         due = [e for e in faults if e.stage == Stage.WAITING and self._is_due(e, tick)]
         if over or due:

@@ -87,10 +87,11 @@ def parse_condition(text: str, layout: Layout) -> tuple[int, int, int]:
         raise LookupError(
             'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"'
         )
-    mailboxes = {mailbox.name: index for index, mailbox in enumerate(layout.mailboxes)}
+    mailboxes = [mailbox.name for mailbox in layout.mailboxes]
     if match[1] not in mailboxes:
         raise LookupError(f"no mailbox '{match[1]}'; mailboxes: {', '.join(mailboxes)}")
-    mailbox = layout.mailboxes[mailboxes[match[1]]]
+    index = mailboxes.index(match[1])
+    mailbox = layout.mailboxes[index]
     fields = {
         f.name: f
         for f in mailbox.fields
@@ -111,7 +112,7 @@ def parse_condition(text: str, layout: Layout) -> tuple[int, int, int]:
             names = ", ".join(dict(field.values))
             valid = names or f"a number from {limits.min} to {limits.max}"
             raise LookupError(f"'{match[3]}' is not a value of '{field.name}'; valid: {valid}")
-    return mailboxes[mailbox.name], mailbox.fields.index(field), value
+    return index, mailbox.fields.index(field), value
 
 
 def format_condition(when: tuple[int, int, int], layout: Layout) -> str:

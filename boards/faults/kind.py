@@ -162,11 +162,6 @@ class Kind:
         return self.where in ("load", "writer", "copy", "lock", "arm")
 
     @property
-    def ends_when_detected(self) -> bool:
-        """Whether the fault ends once it is detected, because the Rack then kills the process."""
-        return self.consequence.ends_process and not self.once
-
-    @property
     def recoverable(self) -> bool:
         """Whether the task can continue after the fault."""
         return self.where != "start"
@@ -283,12 +278,6 @@ class Kinds:
 
     def __iter__(self) -> Iterator[Kind]:
         return iter(self.names.values())
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.names
 
     def __getitem__(self, key: str | int) -> Kind:
         """Return the kind with a name, or with a number in the fault table.

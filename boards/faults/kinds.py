@@ -5,14 +5,44 @@ from __future__ import annotations
 from functools import partial
 
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.faults import bounds, clock_board, tasks
-from rack.boards.faults import drawing as draw
+from rack.boards.faults import clock_board, tasks
 from rack.boards.faults import message_steps as messages
+from rack.boards.faults.bounds import (
+    BY_SIZE,
+    DEATH,
+    DELAY,
+    DELIVERY,
+    LOCK_WAIT,
+    MUTE,
+    NOT_ARMED,
+    READ,
+    RELEASE,
+    SKIP,
+    SLICE,
+    cycle_and_time_bound,
+    cycle_bound,
+    tick_bound,
+    write_bound,
+)
+from rack.boards.faults.drawing import (
+    MAX_SIZE_RATIO,
+    Draw,
+    draw_joint,
+    draw_joint_or_all,
+    log_uniform_number,
+    longest_of,
+    uniform_cycles,
+    uniform_integer,
+    uniform_messages,
+    uniform_number,
+    uniform_seconds,
+    uniform_silence,
+)
 from rack.boards.faults.kind import DIED, KINDS, Consequence, Kind, Parameter
 from rack.levels import fault_steps as arm
 
 BRAKED = ("brakes_closed",)
-DEATH = Consequence(
+PROCESS_ENDS = Consequence(
     own=(Alarm.STALE, Alarm.MUTE, Alarm.CLOCK_STOPPED), reactions=("restart",), ends_process=True
 )
 SENSOR = Consequence(
@@ -36,22 +66,31 @@ NOISE_RAD = 0.005
 _clock = partial(Kind, where="clock", tasks=("clock",))
 _message = partial(Kind, where="writer")
 _sensor = partial(Kind, where="arm", consequence=SENSOR)
-_motor = partial(Kind, where="arm", consequence=MOTOR)
+_motor = partial(
+    Kind,
+    where="arm",
+    consequence=MOTOR,
+    detected_as=(Alarm.ACTUATOR,),
+    lasts=uniform_seconds(0.05, 0.4),
+)
 # The limit gate finds a bad torque in the same cycle, before it reaches the arm.
 _torque = partial(
     Kind,
     where="arm",
     consequence=COMMAND,
-    bound=bounds.cycle_bound(0),
-    lasts=draw.uniform_seconds(0.01, 0.2),
+    bound=cycle_bound(0),
+    lasts=uniform_seconds(0.01, 0.2),
 )
 
 
-def _joint_parameter(drawn: draw.Draw = draw.draw_joint, default: float = 0) -> Parameter:
+def _joint_parameter(drawn: Draw = draw_joint, default: float = 0) -> Parameter:
     """Return the parameter that selects a joint."""
     return Parameter(
         "joint", "1", "joint, counted from 0 (-1: all)", default, -1, 15, is_whole=True, drawn=drawn
     )
+
+
+JOINT = _joint_parameter()
 
 
 def _probability_parameter(default: float, most: float) -> Parameter:
@@ -63,8 +102,18 @@ def _probability_parameter(default: float, most: float) -> Parameter:
         default,
         0.001,
         1.0,
-        drawn=draw.uniform_number(0.5, most),
+        drawn=uniform_number(0.5, most),
     )
+
+
+# Messages arrive late or never, with a probability. The next message shows it.
+_lossy = partial(
+    _message,
+    parameters=(_probability_parameter(0.3, 0.9),),
+    bound=write_bound(1) + DELIVERY,
+    consequence=Consequence(own=(Alarm.MUTE,)),
+    lasts=uniform_messages(4, 8),
+)
 
 
 def _size_parameter(meaning: str, visible: float, least: float, most: float) -> Parameter:
@@ -79,9 +128,17 @@ def _size_parameter(meaning: str, visible: float, least: float, most: float) -> 
         visible,
         least,
         most,
-        drawn=draw.log_uniform_number(visible, draw.MAX_SIZE_RATIO * visible),
+        drawn=log_uniform_number(visible, MAX_SIZE_RATIO * visible),
     )
 
+
+# The size of an error decides when the monitor finds it.
+_sized = partial(
+    _sensor,
+    detected_as=(Alarm.SENSOR_MODEL,),
+    bound=BY_SIZE,
+    lasts=uniform_seconds(0.1, 0.5),
+)
 
 KINDS.add(
     Kind(
@@ -91,8 +148,8 @@ KINDS.add(
         step=clock_board.KILL,
         tasks=("executor", "planner", "clock", "host"),
         detected_as=(DIED,),
-        bound=bounds.DEATH,
-        consequence=DEATH,
+        bound=DEATH,
+        consequence=PROCESS_ENDS,
         once=True,
         within_tick=True,
     ),
@@ -104,9 +161,9 @@ KINDS.add(
         tasks=("executor", "planner", "host"),
         detected_as=(Alarm.HANG,),
         # Four missed releases, plus the release at which the reader notices them.
-        bound=bounds.cycle_bound(4 + 1),
-        consequence=DEATH,
-        lasts=draw.uniform_cycles(7, 10),
+        bound=cycle_bound(4 + 1),
+        consequence=PROCESS_ENDS,
+        lasts=uniform_cycles(7, 10),
         within_tick=True,
     ),
     Kind(
@@ -123,7 +180,7 @@ KINDS.add(
                 1.5,
                 0.0,
                 100.0,
-                drawn=draw.uniform_number(1.2, 2.5),
+                drawn=uniform_number(1.2, 2.5),
             ),
             Parameter(
                 "random",
@@ -137,8 +194,8 @@ KINDS.add(
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),
         # The cycle is still running at its next release.
-        bound=bounds.cycle_bound(1),
-        lasts=draw.uniform_cycles(1, 4),
+        bound=cycle_bound(1),
+        lasts=uniform_cycles(1, 4),
     ),
     Kind(
         name="planner-slow",
@@ -154,12 +211,12 @@ KINDS.add(
                 2.0,
                 0.5,
                 100.0,
-                drawn=draw.uniform_number(1.5, 4.0),
+                drawn=uniform_number(1.5, 4.0),
             ),
         ),
         detected_as=(Alarm.PLAN_LATE,),
-        bound=bounds.SLICE + bounds.RELEASE,
-        lasts=draw.longest_of(draw.uniform_cycles(3, 6), draw.uniform_seconds(1.0, 2.0)),
+        bound=SLICE + RELEASE,
+        lasts=longest_of(uniform_cycles(3, 6), uniform_seconds(1.0, 2.0)),
     ),
     Kind(
         name="hog",
@@ -167,8 +224,8 @@ KINDS.add(
         means="a higher-priority process takes the board's core",
         step=tasks.take_core,
         detected_as=(Alarm.STARVED,),
-        bound=bounds.cycle_bound(4 + 1),
-        lasts=draw.longest_of(draw.uniform_cycles(7, 9), draw.uniform_seconds(0.1, 0.3)),
+        bound=cycle_bound(4 + 1),
+        lasts=longest_of(uniform_cycles(7, 9), uniform_seconds(0.1, 0.3)),
     ),
     _message(
         name="mute",
@@ -178,19 +235,15 @@ KINDS.add(
         not_queued="a queue is written on demand: its silence proves nothing",
         # A message is stale after two periods, but that proves nothing until its writer has
         # finished another release.
-        bound=bounds.MUTE + bounds.READ,
-        lasts=draw.uniform_silence(1.2, 2.0),
+        bound=MUTE + READ,
+        lasts=uniform_silence(1.2, 2.0),
     ),
-    _message(
+    _lossy(
         name="drop",
         means="messages are lost",
         step=messages.Drop,
-        parameters=(_probability_parameter(0.3, 0.9),),
-        detected_as=(Alarm.GAP,),
         # The next message makes the gap in the serials visible.
-        bound=bounds.write_bound(1) + bounds.DELIVERY,
-        consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=draw.uniform_messages(4, 8),
+        detected_as=(Alarm.GAP,),
     ),
     _message(
         name="delay",
@@ -205,27 +258,23 @@ KINDS.add(
                 1,
                 50,
                 is_whole=True,
-                drawn=draw.uniform_integer(1, 5),
+                drawn=uniform_integer(1, 5),
             ),
         ),
         # Until the first delayed message arrives, the mailbox gets no messages.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
-        bound=bounds.DELAY + bounds.DELIVERY,
+        bound=DELAY + DELIVERY,
         # Afterwards the first punctual messages overtake the last delayed ones.
         consequence=Consequence(own=(Alarm.DISORDER,)),
-        lasts=draw.uniform_messages(9, 13),
+        lasts=uniform_messages(9, 13),
     ),
-    _message(
+    _lossy(
         name="reorder",
         means="consecutive messages are swapped",
         step=messages.Reorder,
-        parameters=(_probability_parameter(0.3, 0.9),),
         # If the last message has no successor to be swapped with, it is only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
         not_queued="the messages of one cycle have the same tick: nothing would show their order",
-        bound=bounds.write_bound(1) + bounds.DELIVERY,
-        consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=draw.uniform_messages(4, 8),
     ),
     _message(
         name="corrupt",
@@ -241,13 +290,13 @@ KINDS.add(
                 1,
                 64,
                 is_whole=True,
-                drawn=draw.uniform_integer(1, 16),
+                drawn=uniform_integer(1, 16),
             ),
         ),
         detected_as=(Alarm.DAMAGED,),
-        bound=bounds.DELIVERY,
+        bound=DELIVERY,
         consequence=DAMAGE,
-        lasts=draw.uniform_messages(4, 8),
+        lasts=uniform_messages(4, 8),
     ),
     Kind(
         name="wrong-output",
@@ -286,10 +335,10 @@ KINDS.add(
         # Only a comparison with another copy can find it.
         detected_as=(Alarm.DIFFERS, Alarm.STRAYED),
         not_queued="a level with a queue has no standby, so nothing would find it",
-        bound=bounds.cycle_bound(1) + bounds.tick_bound(1),
+        bound=cycle_bound(1) + tick_bound(1),
         # A vote takes the copy out.
         consequence=Consequence(ends_process=True),
-        lasts=draw.uniform_messages(1, 1),
+        lasts=uniform_messages(1, 1),
     ),
     _message(
         name="babble",
@@ -304,16 +353,16 @@ KINDS.add(
                 3,
                 1000,
                 is_whole=True,
-                drawn=draw.uniform_integer(8, 64),
+                drawn=uniform_integer(8, 64),
             ),
         ),
         detected_as=(Alarm.BABBLE,),
         not_queued=(
             "a queue takes several messages in a cycle, and refuses those that it cannot hold"
         ),
-        bound=bounds.DELIVERY,
+        bound=DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
-        lasts=draw.uniform_cycles(3, 6),
+        lasts=uniform_cycles(3, 6),
     ),
     Kind(
         name="masquerade",
@@ -321,7 +370,7 @@ KINDS.add(
         means="another process forges a message",
         step=clock_board.MASQUERADE,
         detected_as=(Alarm.MASQUERADE,),
-        bound=bounds.DELIVERY,
+        bound=DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP, Alarm.DAMAGED)),
         once=True,
         within_tick=True,
@@ -340,11 +389,11 @@ KINDS.add(
                 0,
                 1,
                 is_whole=True,
-                drawn=draw.uniform_integer(0, 1),
+                drawn=uniform_integer(0, 1),
             ),
         ),
         detected_as=(Alarm.LOCKED, DIED),
-        bound=bounds.LOCK_WAIT + bounds.READ,
+        bound=LOCK_WAIT + READ,
         consequence=Consequence(own=(Alarm.STALE, Alarm.MUTE, Alarm.HANG), ends_process=True),
         realtime=True,
         once=True,
@@ -354,9 +403,9 @@ KINDS.add(
         means="SIGSTOP stops the clock's process",
         step=clock_board.CLOCK_STOP,
         detected_as=(Alarm.CLOCK_STOPPED,),
-        bound=bounds.tick_bound(3),
+        bound=tick_bound(3),
         consequence=Consequence(reactions=("restart",), ends_process=True),
-        lasts=draw.uniform_seconds(0.05, 0.3),
+        lasts=uniform_seconds(0.05, 0.3),
         realtime=True,
         once=True,
         within_tick=True,
@@ -374,11 +423,11 @@ KINDS.add(
                 1,
                 20,
                 is_whole=True,
-                drawn=draw.uniform_integer(1, 20),
+                drawn=uniform_integer(1, 20),
             ),
         ),
         detected_as=(Alarm.CLOCK_SKIPPED,),
-        bound=bounds.SKIP,
+        bound=SKIP,
         once=True,
     ),
     _clock(
@@ -393,24 +442,24 @@ KINDS.add(
                 0.9,
                 0.01,
                 0.95,
-                drawn=draw.uniform_number(0.75, 0.95),
+                drawn=uniform_number(0.75, 0.95),
             ),
             Parameter("least", "ticks", "smallest delay of a tick", 0.6, 0.0, 0.95),
         ),
         detected_as=(Alarm.CLOCK_LATE,),
-        bound=bounds.tick_bound(2),
+        bound=tick_bound(2),
         # In lockstep a simulated arm is sampled and driven late, unlike its model.
         consequence=Consequence(arm=(Alarm.SENSOR_MODEL, Alarm.ACTUATOR), recovery_s=1.0),
-        lasts=draw.uniform_seconds(0.2, 0.6),
+        lasts=uniform_seconds(0.2, 0.6),
     ),
     _sensor(
         name="sensor-nan",
         means="a joint position is NaN",
         step=arm.SensorStep(arm.set_position_nan),
-        parameters=(_joint_parameter(),),
+        parameters=(JOINT,),
         detected_as=(Alarm.SENSOR_RANGE,),
-        bound=bounds.cycle_bound(1),
-        lasts=draw.uniform_seconds(0.02, 0.3),
+        bound=cycle_bound(1),
+        lasts=uniform_seconds(0.02, 0.3),
     ),
     _sensor(
         name="sensor-stuck",
@@ -418,42 +467,36 @@ KINDS.add(
         step=arm.SensorStep(arm.freeze_sample),
         # A stuck sensor cannot be noticed while its joint is at rest, so some draws freeze all
         # joints for long enough that one of them moves.
-        parameters=(_joint_parameter(draw.draw_joint_or_all),),
+        parameters=(_joint_parameter(draw_joint_or_all),),
         # A joint that is driven but shows no velocity looks like one whose motor produces no
         # torque.
         detected_as=(Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
-        bound=bounds.cycle_bound(20),
-        lasts=draw.uniform_seconds(0.5, 1.5),
+        bound=cycle_bound(20),
+        lasts=uniform_seconds(0.5, 1.5),
     ),
     _sensor(
         name="sensor-dropout",
         means="no new samples arrive",
         step=arm.SensorStep(arm.repeat_last_sample),
         detected_as=(Alarm.SENSOR_SILENT,),
-        bound=bounds.cycle_bound(2),
-        lasts=draw.uniform_seconds(0.02, 0.3),
+        bound=cycle_bound(2),
+        lasts=uniform_seconds(0.02, 0.3),
     ),
-    _sensor(
+    _sized(
         name="sensor-bias",
         means="a joint position has an offset",
         step=arm.SensorStep(arm.bias_position),
-        parameters=(_joint_parameter(), _size_parameter("offset", BIAS_RAD, 1e-5, 3.0)),
-        detected_as=(Alarm.SENSOR_MODEL,),
-        bound=bounds.BY_SIZE,
-        lasts=draw.uniform_seconds(0.1, 0.5),
+        parameters=(JOINT, _size_parameter("offset", BIAS_RAD, 1e-5, 3.0)),
         visible_from=BIAS_RAD,
     ),
-    _sensor(
+    _sized(
         name="sensor-noise",
         means="a joint position is noisy",
         step=arm.SensorStep(arm.add_position_noise),
         parameters=(
-            _joint_parameter(),
+            JOINT,
             _size_parameter("standard deviation", NOISE_RAD, 1e-6, 1.0),
         ),
-        detected_as=(Alarm.SENSOR_MODEL,),
-        bound=bounds.BY_SIZE,
-        lasts=draw.uniform_seconds(0.1, 0.5),
         visible_from=NOISE_RAD,
     ),
     _motor(
@@ -461,10 +504,8 @@ KINDS.add(
         means="a motor produces no torque",
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint_parameter(default=1),),
-        detected_as=(Alarm.ACTUATOR,),
         # Dry friction hides the fault for a time, which is more cycles if cycles are shorter.
-        bound=bounds.cycle_and_time_bound(5, 12_500_000),
-        lasts=draw.uniform_seconds(0.05, 0.4),
+        bound=cycle_and_time_bound(5, 12_500_000),
     ),
     _motor(
         name="actuator-saturated",
@@ -479,18 +520,16 @@ KINDS.add(
                 0.1,
                 0.0,
                 0.9,
-                drawn=draw.uniform_number(0.0, 0.05),
+                drawn=uniform_number(0.0, 0.05),
             ),
         ),
-        detected_as=(Alarm.ACTUATOR,),
         # At first this looks like an external load. It shows once the commanded torque rises and
         # the motor's torque does not. In each cycle the joint loop adds 0.3 of the missing torque
         # to its command (twice its bandwidth of 60 rad/s, times the cycle); a working motor would
         # deliver at least 0.3 of that. In the worst case, reversing dry friction hides all of the
         # missing torque at first, which gives 1 / (0.3 * 0.3) cycles. The time is a lower limit
         # because the command rises by less in each cycle if cycles are shorter.
-        bound=bounds.cycle_and_time_bound(12, 30_000_000),
-        lasts=draw.uniform_seconds(0.05, 0.4),
+        bound=cycle_and_time_bound(12, 30_000_000),
     ),
     Kind(
         name="tendon-torn",
@@ -498,19 +537,19 @@ KINDS.add(
         means="a tendon of a hand gives no tension",
         step=arm.TendonStep(),
         parameters=(
-            _joint_parameter(),
+            JOINT,
             Parameter("side", "1", "0: the flexor; 1: the extensor", 0, 0, 1, is_whole=True),
         ),
         detected_as=(Alarm.TENDON,),
         # Five successive cycles with slack; the first sample after the tear is one cycle late.
-        bound=bounds.cycle_bound(5 + 1),
-        lasts=draw.uniform_seconds(0.05, 0.4),
+        bound=cycle_bound(5 + 1),
+        lasts=uniform_seconds(0.05, 0.4),
     ),
     _torque(
         name="command-nan",
         means="a commanded torque is NaN",
         step=arm.CommandStep(arm.set_torque_nan),
-        parameters=(_joint_parameter(),),
+        parameters=(JOINT,),
         detected_as=(Alarm.COMMAND_INVALID,),
     ),
     _torque(
@@ -518,7 +557,7 @@ KINDS.add(
         means="a commanded torque is far beyond its limit",
         step=arm.CommandStep(arm.exceed_torque),
         parameters=(
-            _joint_parameter(),
+            JOINT,
             Parameter(
                 "factor",
                 "1",
@@ -526,7 +565,7 @@ KINDS.add(
                 5.0,
                 1.1,
                 1e6,
-                drawn=draw.log_uniform_number(3.0, 1000.0),
+                drawn=log_uniform_number(3.0, 1000.0),
             ),
         ),
         detected_as=(Alarm.COMMAND_LIMIT,),
@@ -536,7 +575,7 @@ KINDS.add(
         where="start",
         means="the start-up self-test fails",
         detected_as=(),
-        bound=bounds.NOT_ARMED,
+        bound=NOT_ARMED,
         once=True,
     ),
 )

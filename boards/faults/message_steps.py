@@ -86,8 +86,9 @@ class MessageStep:
 
     def hold_message(self, message: Outgoing) -> None:
         """Store a message with a copy of its content, because the buffer will be reused."""
-        content = message.content or bytes(self.writer.message.raw)
-        self.held.append(message._replace(content=content))
+        self.held.append(
+            message._replace(content=message.content or bytes(self.writer.message.raw))
+        )
 
 
 class Mute(MessageStep):
@@ -226,11 +227,10 @@ class HoldLock(MessageStep):
         When a stopped process continues, it releases the lock and passes the message on.
         """
         writer = self.writer
-        is_killed = bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry.count and writer.lock.acquire():
             self.count_action(message)
-            number = signal.SIGKILL if is_killed else signal.SIGSTOP
-            os.kill(os.getpid(), number)
+            is_killed = self.entry.parameters[0]
+            os.kill(os.getpid(), signal.SIGKILL if is_killed else signal.SIGSTOP)
             writer.lock.release()
         self.onward(message)
 
@@ -259,8 +259,9 @@ class FaultyWriter:
         steps = {}
         for entry in faults:
             kind = cast("type[MessageStep]", find_kind(entry).step)
-            running_step = self._steps.get(entry.index)
-            steps[entry.index] = running_step or kind(entry, self._writer, self._index)
+            steps[entry.index] = self._steps.get(entry.index) or kind(
+                entry, self._writer, self._index
+            )
         for index, step in self._steps.items():
             if index not in steps:
                 self._late += step.held
@@ -283,7 +284,7 @@ class FaultyWriter:
         """Whether no fault is active and no delayed message waits to be published."""
         return not self._steps and not self._late
 
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
+    def write(self, tick: int, now: int | None, basis: int) -> bool:
         """Pass the message through all faults and publish the results.
 
         A delayed message becomes visible together with the messages of the cycle that publishes it.
@@ -292,7 +293,7 @@ class FaultyWriter:
         Args:
             tick: Release of the cycle that writes.
             now: Current tick of the clock. None if the message cannot be late.
-            basis: Tick of the information that the message is based on. None means `tick`.
+            basis: Tick of the information that the message is based on.
 
         Returns:
             True if everything was published, and in time for the readers.
@@ -301,11 +302,11 @@ class FaultyWriter:
         self._written = True
         visible_at = self._writer.compute_visible_tick(tick, now)
         for _ in self._writer.iterate_outgoing():
-            self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
+            self._first(Outgoing(tick, tick, visible_at, basis))
         self._show_messages()
         return self._written and self._writer.is_in_time(tick, now)
 
-    def flush_due(self, tick: int, now: int | None = None) -> None:
+    def flush_due(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due at `tick` or whose fault is over."""
         visible_at = self._writer.compute_visible_tick(tick, now)
         late_messages = self._late

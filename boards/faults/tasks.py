@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import random
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from time import monotonic_ns
+from time import monotonic_ns, sleep
 from typing import TYPE_CHECKING, cast
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import FaultEntry, FaultTable, Stage
 from rack.backplane.layout import TaskSpec
-from rack.backplane.process import pin_to_core
+from rack.backplane.process import pin_to_core, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.boards.faults.clock_board import CLOCK_JITTER, draw_lateness
@@ -143,27 +142,31 @@ class TaskFaults:
         if self._clock.is_lockstep:
             self._refresh_simulated_faults(entries, tick)
         begun = [
-            (kind, entry)
-            for kind, entry in ((find_kind(entry), entry) for entry in entries)
+            entry
+            for entry in entries
             # A fault of the arm strikes what all copies of a task simulate.
             if entry.task == self._index
-            or (kind.where == "arm" and self._tasks[entry.task].board == self._spec.board)
+            or (
+                find_kind(entry).where == "arm"
+                and self._tasks[entry.task].board == self._spec.board
+            )
         ]
-        active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
+        active = [(find_kind(entry), entry) for entry in begun if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
         self._apply([entry for kind, entry in active if kind.where in ("writer", "copy", "lock")])
-        arm_faults = [(kind, entry) for kind, entry in active if kind.where == "arm"]
-        self._arm = [entry for _, entry in arm_faults]
+        self._arm = [entry for kind, entry in active if kind.where == "arm"]
         if self._spec.role != "planner":
-            faults = [
-                Fault(kind.name, kind.read_parameters(entry), entry.seed, entry.tick, kind.step)
-                for kind, entry in arm_faults
-            ]
-            cast("Executor", self._level).inject(faults)
+            cast("Executor", self._level).inject(
+                [
+                    Fault(kind.name, kind.read_parameters(entry), entry.seed, entry.tick, kind.step)
+                    for kind, entry in active
+                    if kind.where == "arm"
+                ]
+            )
         return generation if len(active) == len(begun) and not self._late_ticks else -1
 
     def _refresh_simulated_faults(self, entries: Sequence[FaultEntry], tick: int) -> None:
@@ -233,17 +236,17 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     pin_to_core(block[Block.CORE])
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:
-        wait_ns = clock.compute_time_ns(max(entry.tick, clock.tick + 1)) - time.monotonic_ns()
+        wait_ns = clock.compute_time_ns(max(entry.tick, clock.tick + 1)) - monotonic_ns()
         # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
         # one. If that tick has passed, or the run has not started, sleep briefly, because at this
         # priority a busy wait would starve all other processes.
         wait_s = wait_ns * 1e-9 if wait_ns > 0 else MIN_POLL_S
-        time.sleep(min(wait_s, MAX_POLL_S))
+        sleep(min(wait_s, MAX_POLL_S))
     end = clock.compute_time_ns(entry.until)
     entry.record_action(clock.compute_tick())
-    while time.monotonic_ns() < end and not clock.is_stopped:
+    while monotonic_ns() < end and not clock.is_stopped:
         pass
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    set_priority(0)
 
 
 def run_core_fault(segment: Segment, index: int) -> int:

@@ -48,12 +48,12 @@ def read_attributes(level: Executor | Planner) -> Mapping[str, Any]:
         before = _AttributeReader().read_attributes(built, MAX_DEPTH)
     finally:
         built.close()
-    return _omit_missing(
-        (name, _find_changes(value, before.get(name)))
-        if isinstance(value, ObjectAttributes)
-        else (name, value)
+    changes = {
+        name: _find_changes(value, before.get(name))
         for name, value in now.items()
-    )
+        if isinstance(value, ObjectAttributes)
+    }
+    return _omit_missing((now | changes).items())
 
 
 def _find_changes(now: Any, built: Any) -> Any:
@@ -93,11 +93,12 @@ class _AttributeReader:
             depth: Number of further levels of nested objects to show.
         """
         self._seen.add(id(thing))
-        plain = [
-            (name, self._to_plain(getattr(thing, name), depth))
-            for name in list_attribute_names(thing)
-        ]
-        return ObjectAttributes(_omit_missing(plain))
+        return ObjectAttributes(
+            _omit_missing(
+                (name, self._to_plain(getattr(thing, name), depth))
+                for name in list_attribute_names(thing)
+            )
+        )
 
     def _to_plain(self, thing: Any, depth: int) -> Any:
         """Return a value as plain data, or `_NOTHING` if it is not shown."""
@@ -125,8 +126,7 @@ class _AttributeReader:
     def _array_to_plain(self, array: Any, depth: int) -> Any:
         """Return an array, a numpy number or a record as plain data."""
         if array.size > MAX_ITEMS:
-            sizes = " x ".join(map(str, array.shape))
-            return f"{sizes} of {array.dtype.name}"
+            return f"{' x '.join(map(str, array.shape))} of {array.dtype.name}"
         if array.shape:
             return [self._array_to_plain(row, depth) for row in array]
         if array.dtype.names is None:

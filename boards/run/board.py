@@ -39,9 +39,6 @@ from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 from rack.levels.references import find_class
 
-CLOCK_LOCK = "rack.boards.run.clock_standby"
-EXCLUSIVE_CORES = "rack.backplane.exclusive_cores"
-REPLICA = "rack.boards.run.replica"
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
 REPEATS_FACTOR = 1 << 16
@@ -129,7 +126,6 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
     """Build and test the level of a task, then run its cycles. See `run_task_board`."""
     spec = segment.layout.find_task(wiring.task)
     copier = Copier(segment, wiring.task, copies) if has_snapshots_enabled(segment) else None
-    block = segment.get_block(wiring.task)
     kind: type[Executor] | type[Planner] = find_class(
         wiring.target, Planner if spec.role == "planner" else Executor
     )
@@ -157,12 +153,13 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             task = PlannerLoop(segment, wiring, level, attention)
         elif len(segment.layout.list_copies(spec.board)) > 1:
             # Import it only in racks that have standbys.
-            task = import_module(REPLICA).ReplicatedLoop(segment, wiring, level, attention)
+            replica = import_module("rack.boards.run.replica")
+            task = replica.ReplicatedLoop(segment, wiring, level, attention)
         else:
             task = VirtualControlLoop(segment, wiring, level, attention)
         if copier is not None:
-            task.next_cycle.copy = partial(copy_task, task, level, copier, attention)
-        block[Block.STATE] = TaskState.READY
+            task.next_cycle.copy = partial(copy_task, task, copier, attention)
+        segment.get_block(wiring.task)[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()
         task.run()
@@ -193,7 +190,7 @@ def _enter_exclusive_core(segment: Segment, core: int) -> None:
     """Enter the group of a core that the rack has to itself."""
     if segment.words[System.EXCLUSIVE_CORES]:
         # Import it only in racks that need it.
-        import_module(EXCLUSIVE_CORES).enter_core(segment.rack, core)
+        import_module("rack.backplane.exclusive_cores").enter_core(segment.rack, core)
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
@@ -216,7 +213,8 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     hold_memory(wiring.lockstep)
     if wiring.copy is not None:
         # Import it only in racks whose clock has a standby. The lock ends with this process.
-        import_module(CLOCK_LOCK).await_clock_lock(segment, is_standby=wiring.copy > 0)
+        clock_standby = import_module("rack.boards.run.clock_standby")
+        clock_standby.await_clock_lock(segment, is_standby=wiring.copy > 0)
         if segment.words[System.STATE] == Run.STOPPED:
             return 0
     with keep_cores_awake() if wiring.keeps_awake else nullcontext():

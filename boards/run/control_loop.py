@@ -41,7 +41,7 @@ class VirtualControlLoop(Task):
     """
 
     def __init__(
-        self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None
+        self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None
     ) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
@@ -163,7 +163,7 @@ class PlannerLoop(Task):
     """
 
     def __init__(
-        self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None = None
+        self, segment: Segment, wiring: TaskWiring, planner: Planner, attention: int | None
     ) -> None:
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
@@ -186,7 +186,7 @@ class PlannerLoop(Task):
         deadline = tick + self.slice
         self.next_cycle.skip_until(deadline)
         self.block[Block.DEADLINE] = deadline
-        self.stopwatch.notify_clock()
+        watch.notify_clock()
         self.planner.plan(tick)
         self.faults.burn_time(tick)
         ended = self.end_computing(tick, deadline) if self.simulated.steps else None

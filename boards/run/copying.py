@@ -40,8 +40,6 @@ MAX_NOTE_FILES = 2
 """Maximum number of descriptors sent with a `CopyMessage`."""
 ReadAttributes = Callable[[], Mapping[str, Any]]
 """Returns the attributes of a level."""
-_DESCRIPTORS = Path("/proc/self/fd")
-_THREADS = Path("/proc/self/task")
 
 
 @dataclass(frozen=True)
@@ -167,11 +165,7 @@ class Copier:
         return request
 
     def _await_request(
-        self,
-        crate: Connection,
-        offsets: Mapping[int, int],
-        seeds: Any,
-        show: ReadAttributes,
+        self, crate: Connection, offsets: Mapping[int, int], seeds: Any, show: ReadAttributes
     ) -> tuple[ContinueRequest, int]:
         """In a copy, wait for the request to continue. Answer requests for attributes until then.
 
@@ -222,7 +216,9 @@ class Copier:
             and not os.path.samestat(os.fstat(fd), segment)
             and not _is_read_only(fd)
         ]
-        threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
+        threads = [
+            path for path in Path("/proc/self/task").iterdir() if path.name != str(os.getpid())
+        ]
         return resources + [
             f"it runs the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
@@ -247,7 +243,7 @@ def _show_attributes(crate: Connection, show: ReadAttributes) -> None:
 def _list_open_files() -> dict[int, str]:
     """Return a dictionary from descriptor to file name, for the open files of this process."""
     name_by_descriptor = {}
-    for entry in [*_DESCRIPTORS.iterdir()]:
+    for entry in [*Path("/proc/self/fd").iterdir()]:
         # The descriptor of the listing itself is closed by now.
         with suppress(FileNotFoundError):
             name_by_descriptor[int(entry.name)] = str(entry.readlink())

@@ -109,8 +109,9 @@ class HandOverDirector:
         """Request a hand-over for an operator, if a standby has the state of the active copy."""
         group = self._groups.get(board)
         if group is not None and not self._hand_over(group, HandOver.COMMANDED):
-            tick = self._driver.words[System.TICK]
-            self._driver.alarms.raise_alarm(tick, Alarm.NOT_SWITCHED, group.active.index)
+            self._driver.alarms.raise_alarm(
+                self._driver.words[System.TICK], Alarm.NOT_SWITCHED, group.active.index
+            )
 
     def is_served(self, task: ReleasedTask) -> bool:
         """Return True if another copy does the work of a lost task."""

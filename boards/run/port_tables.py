@@ -133,7 +133,7 @@ class WriteTable(PortTable):
             port["sources"] = sources.ctypes.data
             port["source_count"] = len(sources)
             port["every"] = spec.every
-            port["ahead"] = spec.lead_ticks - spec.phase
+            port["ahead"] = spec.due_offset
             port["delay"] = writer.compute_visible_tick(0, None)
 
     def write(self, tick: int) -> bool:

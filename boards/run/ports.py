@@ -150,6 +150,10 @@ class OutputPort:
     cycles in which the level has sent a message. Any other mailbox is written in every cycle in
     which it is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the
     board sends the level's message once in each of these cycles.
+
+    Attributes:
+        faulty: Writer that carries out faults. None if no fault acts on the mailbox, and no delayed
+            message is still to be published.
     """
 
     def __init__(
@@ -174,12 +178,10 @@ class OutputPort:
             self.value = Sender(writer.message, self._mark_sent, lambda: 1)
         elif isinstance(writer, QueueWriter) and sends:
             self.value = Sender(writer.message, writer.send, writer.count_free_places)
-        # A cycle is due to write if its message becomes visible at a tick of the mailbox's grid.
-        # This is so if the sum of its tick and this number is a multiple of the mailbox's period.
-        self._ahead = spec.lead_ticks - spec.phase
+        self._due_offset = spec.due_offset
         self._index = segment.layout.find_mailbox_index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
-        self._faulty: FaultyWriter | None = None
+        self.faulty: FaultyWriter | None = None
         self._held_up = self._refused = 0
 
     def _mark_sent(self, basis: int | None = None) -> bool:
@@ -208,20 +210,15 @@ class OutputPort:
             if entry.mailbox in (-1, self._index)
             and not (self._is_queue and find_kind(entry).not_queued)
         ]
-        if chosen and self._faulty is None:
-            self._faulty = FaultyWriter(self.writer, self._index)
-        if self._faulty is not None:
-            self._faulty.apply_faults(chosen)
+        if chosen and self.faulty is None:
+            self.faulty = FaultyWriter(self.writer, self._index)
+        if self.faulty is not None:
+            self.faulty.apply_faults(chosen)
 
     def find_content(self, tick: int) -> bytes | memoryview:
         """Return the message that a standby holds back in the cycle released at `tick`."""
-        faulty = self._faulty
+        faulty = self.faulty
         return self.writer.message.raw if faulty is None else faulty.find_content(tick)
-
-    @property
-    def is_faulty(self) -> bool:
-        """True if faults act on the mailbox, or delayed messages are still to be published."""
-        return self._faulty is not None
 
     def write(self, tick: int, now: int | None) -> bool:
         """Write the message if it is due, and raise alarms about the mailbox.
@@ -234,10 +231,10 @@ class OutputPort:
             False if the message was published too late.
         """
         writer = self.writer
-        if self._faulty is not None and self._faulty.is_over:
-            self._faulty = None
+        if self.faulty is not None and self.faulty.is_over:
+            self.faulty = None
         in_time = True
-        if (tick + self._ahead) % writer.spec.every or not self._is_sent:
+        if (tick + self._due_offset) % writer.spec.every or not self._is_sent:
             self.flush_delayed(tick, now)
         else:
             basis = min([source.basis for source in self.sources if source.serial], default=tick)
@@ -246,15 +243,15 @@ class OutputPort:
                 basis = basis if self._basis is None else self._basis
             elif isinstance(writer, QueueWriter) and self._sends_itself:
                 writer.send()
-            in_time = (self._faulty or writer).write(tick, now, basis)
+            in_time = (self.faulty or writer).write(tick, now, basis)
         if writer.intruder or writer.held_up or writer.refused:
             self.report_findings(tick)
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:
         """Publish messages that faults have delayed and that are due now."""
-        if self._faulty is not None:
-            self._faulty.flush_due(tick, now)
+        if self.faulty is not None:
+            self.faulty.flush_due(tick, now)
 
     def report_findings(self, tick: int) -> None:
         """Raise alarms about an intruder, refused messages, or a lock held by a dead process."""
@@ -325,7 +322,7 @@ class OutputPorts:
         """Set the active faults of all mailboxes. Each port applies those that concern it."""
         for port in self.ports:
             port.apply_faults(faults)
-        self._is_faulty = any(port.is_faulty for port in self.ports)
+        self._is_faulty = any(port.faulty is not None for port in self.ports)
 
     @property
     def bus_errors(self) -> int:
@@ -353,7 +350,7 @@ class OutputPorts:
             if not port.write(tick, now):
                 in_time = False
         if self._is_faulty:
-            self._is_faulty = any(port.is_faulty for port in self.ports)
+            self._is_faulty = any(port.faulty is not None for port in self.ports)
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:

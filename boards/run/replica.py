@@ -62,10 +62,6 @@ class ReplicatedOutput:
         self.slots = Slots(segment, self.spec)
         self.held: bytes | memoryview = port.writer.message.raw
 
-    def is_due(self, tick: int) -> bool:
-        """Return True if the cycle released at `tick` writes this mailbox."""
-        return (tick + self.spec.lead_ticks - self.spec.phase) % self.spec.every == 0
-
     def hold_message(self, tick: int) -> None:
         """Hold back the message of the cycle released at `tick`."""
         self.held = self._port.find_content(tick)
@@ -119,16 +115,17 @@ class ReplicatedLoop(VirtualControlLoop):
     outputs_class = ReplicatedOutputs
 
     def __init__(
-        self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None = None
+        self, segment: Segment, wiring: TaskWiring, executor: Executor, attention: int | None
     ) -> None:
         super().__init__(segment, wiring, executor, attention)
         self._layout = segment.layout
         self._compares = wiring.compares
         self._votes = wiring.votes
-        writers = tuple(self.outputs.writers.values())
+        writers = self.outputs.writers.values()
         self.right = WritingRight(segment, self.spec, writers, self.alarms)
         self._group = self.right.group
-        self._blocks = segment.get_copy_blocks(self.spec.board)
+        copies = segment.layout.list_copies(self.spec.board)
+        self._blocks = [segment.get_block(copy.name) for copy in copies]
         self._outputs = [ReplicatedOutput(segment, port) for port in self.outputs.ports]
         self._held_tick: int | None = None  # last cycle whose messages were held back
         self._late = self._quiet_until = -1
@@ -223,9 +220,12 @@ class ReplicatedLoop(VirtualControlLoop):
                 block[Block.ALIGNED] = block[Block.ALIGNED] or held + 1
                 return
             if was_aligned and self._compares and tick > self._quiet_until:
-                subject = self._layout.mailboxes.index(differing.spec)
-                field = differing.find_difference()
-                self.alarms.raise_alarm(tick, Alarm.DIFFERS, subject, text=field)
+                self.alarms.raise_alarm(
+                    tick,
+                    Alarm.DIFFERS,
+                    self._layout.mailboxes.index(differing.spec),
+                    text=differing.find_difference(),
+                )
             stray = self._find_stray(held, due) if self._votes else None
             if stray is not None and was_aligned:
                 self._group[Block.STRAYED] = stray + 1
@@ -265,7 +265,11 @@ class ReplicatedLoop(VirtualControlLoop):
 
     def _list_due(self, tick: int) -> list[ReplicatedOutput]:
         """Return the outputs that the cycle released at `tick` writes."""
-        return [output for output in self._outputs if output.is_due(tick)]
+        return [
+            output
+            for output in self._outputs
+            if (tick + output.spec.due_offset) % output.spec.every == 0
+        ]
 
     def _write_or_hold(self, tick: int, now: int | None) -> bool:
         """Write the messages of a cycle if this copy is active, and hold them back otherwise."""

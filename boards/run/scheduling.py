@@ -8,11 +8,8 @@ from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.process import DEADLINE, reserve_time, set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, Scheduler, System
+from rack.backplane.words import SCHEDULERS, Block, Scheduler, System
 from rack.boards.wiring import Scheduling
-
-EARLIEST = Scheduler.EARLIEST_DEADLINE_FIRST
-BY_WORD = {scheduler.word: scheduler for scheduler in Scheduler}
 
 
 class SchedulerChanges:
@@ -45,7 +42,7 @@ class SchedulerChanges:
             word: Name of its new scheduler. Any other word has no effect.
             tick: Current tick.
         """
-        scheduler = BY_WORD.get(word)
+        scheduler = SCHEDULERS.get(word)
         if scheduler is None or name not in self._schedulings:
             return
         task = self._tasks[name]
@@ -60,7 +57,7 @@ class SchedulerChanges:
         priority = task.spec.priority
         if scheduler is Scheduler.MAXIMUM_URGENCY_FIRST:
             return "Linux has no such scheduler"
-        if scheduler is EARLIEST:
+        if scheduler is Scheduler.EARLIEST_DEADLINE_FIRST:
             priority = DEADLINE
             scheduling = self._schedulings[task.spec.name]
             # A clock with a priority would run below a board with a deadline on its core.

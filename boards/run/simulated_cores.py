@@ -63,9 +63,9 @@ class SimulatedCores:
         self._driver = driver
         self._clock_ns = clock_ns
         self._tasks = {task.spec.name: task for task in driver.tasks}
-        begin_ns = driver.first_tick * clock_ns
         self._cores = {
-            core: SimulatedCore(begin_ns) for core in sorted({load.core for load in loads.values()})
+            core: SimulatedCore(driver.first_tick * clock_ns)
+            for core in sorted({load.core for load in loads.values()})
         }
 
     def run_tick(self, tick: int) -> None:
@@ -99,8 +99,11 @@ class SimulatedCores:
         if name != CLOCK:
             return Scheduler(self._tasks[name].block[Block.SCHEDULER])
         core = self._loads[CLOCK].core
-        others = [other for other, load in self._loads.items() if load.core == core]
-        schedulers = (self._find_scheduler(other) for other in others if other != CLOCK)
+        schedulers = (
+            self._find_scheduler(other)
+            for other, load in self._loads.items()
+            if load.core == core and other != CLOCK
+        )
         return max(schedulers, default=Scheduler.FIXED_PRIORITY)
 
     def _add_job(

@@ -51,10 +51,6 @@ class SimulatedTime:
             if mailbox.writer == spec.name
         )
 
-    def insert_step(self, step: FinishStep, is_active: bool) -> None:
-        """Make a step the first one if it is active. Otherwise remove it."""
-        self.steps = [step] * is_active + [other for other in self.steps if other != step]
-
     def find_end_tick(self, tick: int, deadline: int) -> int | None:
         """Compute the end of a cycle.
 

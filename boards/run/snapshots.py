@@ -23,7 +23,6 @@ from rack.boards.run.attributes import read_attributes
 from rack.boards.run.copying import Copier
 from rack.boards.run.settings import change_settings
 from rack.boards.run.task import Task
-from rack.levels.level import Executor, Planner
 
 FIRST_COST_S = 0.05
 """Time for which a snapshot is assumed to stop the rack, before the first one is measured."""
@@ -35,13 +34,11 @@ COPY_REFUSED = -1
 
 def has_snapshots_enabled(segment: Segment) -> bool:
     """Return True if snapshots are enabled for the rack."""
-    words = segment.words
-    return any(
-        words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
-    )
+    enabling = System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT
+    return any(segment.words[word] for word in enabling)
 
 
-def copy_task(task: Task, level: Executor | Planner, copier: Copier, attention: int) -> None:
+def copy_task(task: Task, copier: Copier, attention: int) -> None:
     """Fork a copy of a task between two of its cycles, when the clock requests one.
 
     The clock is told that the copy exists, or that the task cannot be copied. In the copy, this
@@ -49,20 +46,19 @@ def copy_task(task: Task, level: Executor | Planner, copier: Copier, attention: 
 
     Args:
         task: The task.
-        level: The level that it runs.
         copier: Forks copies of its process.
         attention: Event descriptor that wakes the Rack.
     """
     block = task.block
     try:
-        request = copier.fork_copy(block[Block.COPY] - 1, show=partial(read_attributes, level))
+        request = copier.fork_copy(block[Block.COPY] - 1, show=partial(read_attributes, task.level))
     except SnapshotError as error:
         write_line(sys.stderr, f"{NO_SNAPSHOTS_PREFIX}{error}")
         block[Block.COPY] = COPY_REFUSED
     else:
         if request is not None:
             if request.context is not None:
-                change_settings(level, request.context)
+                change_settings(task.level, request.context)
             block[Block.PID] = os.getpid()
             block[Block.STATE] = TaskState.RUNNING
             task.stopwatch.start_counting()

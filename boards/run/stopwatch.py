@@ -144,8 +144,6 @@ class Stopwatch:
         if self.core_ns is not None:
             self._simulate_stamps(*self.core_ns)
         used_ns = thread_time_ns()
-        used_before_ns = self._processor_ns
-        self._processor_ns = used_ns
         self._trace.write(
             tick,
             self._release_ns,
@@ -156,9 +154,10 @@ class Stopwatch:
             self.end_ns,
             flags,
             state,
-            used_ns - used_before_ns,
+            used_ns - self._processor_ns,
             self._closed_ns,
         )
+        self._processor_ns = used_ns
         self._cycles = block[Block.CYCLES] = self._cycles + 1
         if not self._cycles % BUS_COUNT_CYCLES:
             # In lockstep the clock may kill this process as soon as its release is done.

@@ -20,12 +20,7 @@ from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import State
-from rack.backplane.operator_table import (
-    Client,
-    OperatorTable,
-    RequestEntry,
-    RequestStage,
-)
+from rack.backplane.operator_table import Client, OperatorTable, RequestEntry, RequestStage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, HandOver, Run, System, is_switched_on
@@ -41,9 +36,6 @@ if TYPE_CHECKING:
     from rack.boards.run.scheduling import SchedulerChanges
     from rack.boards.run.simulated_cores import SimulatedCores
 
-SCHEDULING = "rack.boards.run.scheduling"
-HAND_OVER = "rack.boards.run.hand_over"
-SIMULATED_CORES = "rack.boards.run.simulated_cores"
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
 OPERATOR_TIMEOUT_NS = 1_000_000_000
@@ -73,14 +65,13 @@ class SystemController:
         self._desk = OperatorCommandIssuer(segment, driver.alarms)
         if wiring.schedulings:
             # Import it only in racks that name a scheduler.
-            self._desk.changes = import_module(SCHEDULING).SchedulerChanges(
+            self._desk.changes = import_module("rack.boards.run.scheduling").SchedulerChanges(
                 segment, driver.tasks, wiring.schedulings, driver.alarms
             )
-        self._hand_overs: HandOverDirector | None = None
         if segment.layout.replicated_tasks:
             # Import it only in racks that have standbys.
-            self._hand_overs = import_module(HAND_OVER).HandOverDirector(segment, driver)
-            self._desk.hand_overs = self._hand_overs
+            hand_over = import_module("rack.boards.run.hand_over")
+            self._desk.hand_overs = hand_over.HandOverDirector(segment, driver)
         self._settled: tuple[int, int, int, int] | None = None
         self._demand = to_enum(Demand, self._words[System.DEMAND])
         self.cores: SimulatedCores | None = None
@@ -94,8 +85,8 @@ class SystemController:
             faults.advance_faults(tick)
         if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
             desk.issue_due_commands(tick)
-        if self._hand_overs is not None:
-            self._hand_overs.check_active_copies()
+        if desk.hand_overs is not None:
+            desk.hand_overs.check_active_copies()
         if self._settled != (
             words[System.LOSSES],
             self._driver.watchdog.losses,
@@ -126,6 +117,7 @@ class SystemController:
         words = self._words
         seen = words[System.LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
+        hand_overs = self._desk.hand_overs
         for task in processes:
             if task.is_lost:
                 self._handle_loss(task, tick)
@@ -136,7 +128,7 @@ class SystemController:
         demands = [
             (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index)
             for task in lost
-            if self._hand_overs is None or not self._hand_overs.is_served(task)
+            if hand_overs is None or not hand_overs.is_served(task)
         ]
         if emergency:
             demands.append((Demand.BRAKE, -1))
@@ -160,8 +152,7 @@ class SystemController:
         be restarted causes the emergency stop and then the end of the run. A host board that will
         not be restarted is treated as rejoined, and its bus adapter reports the loss.
         """
-        lockstep = self._wiring.lockstep
-        if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
+        if self._wiring.lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
         self._driver.await_state(task, lambda: task.is_ready or task.is_given_up)
         if task.is_ready:
@@ -201,18 +192,17 @@ class OperatorCommandIssuer:
         self._layout = segment.layout
         self._table = OperatorTable(segment)
         self._clock = SystemClock(segment)
-        self._boxes = segment.layout.mailboxes
+        boxes = segment.layout.mailboxes
         self._writers = {
             at: open_writer(segment, box.name)
-            for at, box in enumerate(self._boxes)
+            for at, box in enumerate(boxes)
             if box.writer == CLOCK
         }
-        statuses = {at: f"{self._boxes[at].name.partition('.')[0]}.status" for at in self._writers}
-        answering = {
-            box.name for box in self._boxes if "order" in {field.name for field in box.fields}
-        }
+        answering = {box.name for box in boxes if "order" in {field.name for field in box.fields}}
         self._statuses = {
-            at: open_observer(segment, name) for at, name in statuses.items() if name in answering
+            at: open_observer(segment, name)
+            for at in self._writers
+            if (name := f"{boxes[at].name.partition('.')[0]}.status") in answering
         }
         self.requested = -1
         self.next_tick = 0
@@ -221,8 +211,9 @@ class OperatorCommandIssuer:
         self._newest: dict[int, int] = {}
         """Serial of the newest command that replaces earlier ones, by mailbox."""
         # In lockstep a tick has no fixed length in real time, so silence is not checked.
-        in_time = not self._words[System.LOCKSTEP]
-        self._silent = OPERATOR_TIMEOUT_NS // segment.layout.clock_ns if in_time else sys.maxsize
+        self._silent = sys.maxsize
+        if not self._words[System.LOCKSTEP]:
+            self._silent = OPERATOR_TIMEOUT_NS // segment.layout.clock_ns
 
     def issue_due_commands(self, tick: int) -> None:
         """Check all leases, then issue all commands due at `tick`."""
@@ -257,8 +248,7 @@ class OperatorCommandIssuer:
         message.id = entry.serial
         writer.write(tick, self._clock.compute_tick())
         if message.what == Operation.SCHEDULE and self.changes is not None:
-            board = find_level(entry, self._layout)
-            self.changes.change_scheduler(board, message.name, tick)
+            self.changes.change_scheduler(find_level(entry, self._layout), message.name, tick)
         entry.stage = RequestStage.GIVEN
         if message.what == Operation.SWITCH and self.hand_overs is not None:
             self.hand_overs.switch_copy(find_level(entry, self._layout))
@@ -278,7 +268,6 @@ class OperatorCommandIssuer:
             entry: Entry of a command that was issued under a lease.
             tick: Current tick.
         """
-        mailbox = entry.mailbox
         if self._is_superseded(entry):
             self._table.release_lease(entry)
         if entry.client == Client.LEASES:
@@ -286,9 +275,9 @@ class OperatorCommandIssuer:
             if self._table.is_client_alive(entry) and tick - heard <= self._silent:
                 return
             # Issue the hold command directly, without a request, because the table may be full.
-            writer = self._writers[mailbox]
+            writer = self._writers[entry.mailbox]
             self._words[System.COMMANDED] += 1
-            writer.message.raw[:] = build_hold_command(self._boxes[mailbox]).raw
+            writer.message.raw[:] = build_hold_command(self._layout.mailboxes[entry.mailbox]).raw
             writer.message.id = self._words[System.COMMANDED]
             writer.write(tick, self._clock.compute_tick())
             self._table.release_lease(entry)
@@ -323,7 +312,7 @@ class EndOfRun:
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
-        self._stop_tick = wiring.stop_tick or None
+        self._stop_tick = wiring.stop_tick
         self._task_ends: int | None = None
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
@@ -363,12 +352,10 @@ class EndOfRun:
             is_over = reading.is_new and reading.message.state in (State.DONE, State.ERROR)
             if is_over or boundary - self._heard >= self._silent or tick >= self._longest:
                 self._task_ends = max(boundary + self._linger, tick)
-        return self._task_ends if self._stop_tick is None else self._stop_tick
+        return self._stop_tick or self._task_ends
 
 
-def run_clock(
-    segment: Segment, wiring: ClockWiring, attention: int, copier: Copier | None = None
-) -> None:
+def run_clock(segment: Segment, wiring: ClockWiring, attention: int, copier: Copier | None) -> None:
     """Run the clock until the run is over. A restarted clock continues on the existing grid.
 
     Args:
@@ -406,7 +393,7 @@ def run_clock(
     driver.controller = controller = SystemController(segment, wiring, driver, end_of_run)
     if isinstance(driver, LockstepDriver) and any(s.cost_ns for s in wiring.schedulings.values()):
         driver.permits_batches = False
-        controller.cores = import_module(SIMULATED_CORES).SimulatedCores(
+        controller.cores = import_module("rack.boards.run.simulated_cores").SimulatedCores(
             wiring.schedulings, driver, segment.layout.clock_ns
         )
     driver.run()

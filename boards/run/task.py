@@ -24,7 +24,6 @@ from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
-SIMULATED_CORES = "rack.boards.run.simulated_cores"
 PUNCTUAL_TICKS = 20
 """Number of ticks without a late one after which the next late tick raises an alarm again."""
 _P = ParamSpec("_P")
@@ -37,6 +36,7 @@ class Task(ABC):
     Attributes:
         spec: Description of the task from the layout.
         block: Control block of the task.
+        level: The executor or planner.
         simulated: Simulated times of the cycles, in lockstep.
         serve: Function that serves the board's interrupts in each cycle. None if nothing
             interrupts the board, or another of its tasks serves the interrupts.
@@ -49,12 +49,12 @@ class Task(ABC):
         segment: Segment,
         wiring: TaskWiring,
         level: Executor | Planner,
-        attention: int | None = None,
+        attention: int | None,
     ) -> None:
         self.spec = spec = segment.layout.find_task(wiring.task)
         self.block = segment.get_block(wiring.task)
         self.words = segment.words
-        self._level = level
+        self.level = level
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
         self.next_cycle = NextCycle(
@@ -90,8 +90,8 @@ class Task(ABC):
             # Import it only in racks that need it.
             # The step of an interrupt handler includes the budget of the cycle.
             cost_ns = 0 if handler else wiring.scheduling.cost_ns
-            await_job_end = import_module(SIMULATED_CORES).await_job_end
-            self.simulated.steps.append(partial(await_job_end, self, cost_ns))
+            simulated_cores = import_module("rack.boards.run.simulated_cores")
+            self.simulated.steps.append(partial(simulated_cores.await_job_end, self, cost_ns))
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
@@ -106,11 +106,14 @@ class Task(ABC):
             self._generation = faults.refresh_faults(tick)
             if faults.taken_until <= tick:
                 if self.clock.is_lockstep:
-                    self.simulated.insert_step(faults.extend_computing, bool(faults.loads))
+                    # Faults extend the computing before any other step.
+                    extend = faults.extend_computing
+                    others = [step for step in self.simulated.steps if step != extend]
+                    self.simulated.steps = [extend] * bool(faults.loads) + others
                     late_ticks = faults.find_lateness(tick)
                     late_ns = int(late_ticks * self.clock.period_ns)
                     self.simulated.late_ns = self.stopwatch.late_ns = late_ns
-                    self._level.late_s = late_ticks * self._level.context.tick_s
+                    self.level.late_s = late_ticks * self.level.context.tick_s
                 return tick
             # The core is taken: the task gets its newest release once the core is free again.
             self.next_cycle.return_release(tick)
@@ -182,7 +185,7 @@ class ClockGuard:
             )
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
-    def check_release(self, tick: int, late_ns: int = 0) -> None:
+    def check_release(self, tick: int, late_ns: int) -> None:
         """Raise an alarm, once per episode, if the cycle began late because the clock was late.
 
         Args:
@@ -218,12 +221,12 @@ class InterruptHandler:
         self, segment: Segment, wiring: TaskWiring, inbox: BoardInbox, alarms: AlarmWriter
     ) -> None:
         self._inbox = inbox
-        spec = segment.layout.find_task(wiring.task)
         self._block = segment.get_block(wiring.task)
         self._clock = clock = SystemClock(segment)
         self._clock_ns = segment.layout.clock_ns
         self._budget_ns = wiring.budget_ns
-        self._longest_ns = MAX_PREEMPTED_CYCLES * spec.every * self._clock_ns
+        every = segment.layout.find_task(wiring.task).every
+        self._longest_ns = MAX_PREEMPTED_CYCLES * every * self._clock_ns
         self._sources = [source for source in inbox.sources if source.is_periodic]
         self._lines = [
             (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()

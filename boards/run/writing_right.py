@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import TaskSpec
@@ -21,7 +21,7 @@ class WritingRight:
     """
 
     def __init__(
-        self, segment: Segment, spec: TaskSpec, writers: Sequence[Writer], alarms: AlarmWriter
+        self, segment: Segment, spec: TaskSpec, writers: Collection[Writer], alarms: AlarmWriter
     ) -> None:
         """Prepare to take the right.
 
@@ -37,7 +37,7 @@ class WritingRight:
         self._block = segment.get_block(spec.name)
         self._lock = ByteLock(segment.fd, segment.map.blocks[spec.board] + 8 * Block.ACTIVE)
         self._index = layout.processes.index(spec)
-        self._writers = tuple(writers)
+        self._writers = writers
         self._alarms = alarms
 
     @property

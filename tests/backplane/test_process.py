@@ -159,8 +159,8 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
     core = min(os.sched_getaffinity(0))
 
     def take() -> bool:
-        assert take_core(core, 5) == 5
-        hold_memory()
+        assert take_core(core, 5, None) == 5
+        hold_memory(lockstep=False)
         assert os.sched_getaffinity(0) == {core}
         mapped, locked = read_memory_sizes(os.getpid())
         assert mapped >= locked > 0
@@ -171,7 +171,7 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
         return not gc.isenabled() and read_memory_sizes(os.getpid())[1] == 0
 
     def be_ordinary() -> bool:
-        assert take_core(core, 0) == 0
+        assert take_core(core, 0, None) == 0
         disable_timer_slack()
         return Path("/proc/self/timerslack_ns").read_text().strip() == "1"
 

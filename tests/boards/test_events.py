@@ -74,7 +74,7 @@ def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
 
 
 def ending(segment: Segment, ends_run: str | None = "upper.status") -> Ending:
-    return Ending(segment, ends_run, SILENT)
+    return Ending(segment, ends_run, SILENT, 0)
 
 
 @pytest.mark.parametrize(

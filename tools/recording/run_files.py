@@ -73,7 +73,7 @@ def find_missing(
     """
     missing = {}
     for name, ring in open_rings(segment).items():
-        ring.resume_after(taken[name])
+        ring.taken = taken[name]
         written = taken[name] - ring.before + ring.waiting_count
         left, overwritten = ring.read_new_rows()
         if rows := lost[name] + overwritten + len(left):

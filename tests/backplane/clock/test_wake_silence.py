@@ -83,7 +83,7 @@ def test_a_silence_is_reported_once_and_the_next_one_again(watched: Silence) -> 
     watched.tick(7)
     assert [len(watched.check(now)) for now in (9, 10, 40)] == [1, 0, 0]
     watched.tick(40)
-    watched.clock.record_release()
+    watched.clock.is_reported = False
     assert [len(watched.check(now)) for now in (42, 43)] == [1, 0]
     # The clock has caught up, as a check sees it.
     watched.tick(43)

@@ -90,7 +90,7 @@ def heard(
     wave = PublishedLevel(names=("first", "second"), findings=FINDINGS)
     reader = AlarmReader(segment)
     reader._joints, reader._geom, reader._levels = JOINTS, geom, {"wave": wave}
-    return reader.build_event(row, owner)
+    return reader.read_row(row, owner).event
 
 
 @pytest.mark.parametrize(

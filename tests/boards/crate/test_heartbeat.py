@@ -179,5 +179,5 @@ def test_a_task_that_computes_in_lockstep_hangs_only_after_that_much_processor_t
         assert found == ([] if doing == "computes" else [SLOW])
         # Meanwhile the clock waits for the task, and does not hang.
         if doing == "computes":
-            monkeypatch.setattr(beat, "_bounds", dict.fromkeys((FAST, SLOW, CLOCK), 0.05))
+            monkeypatch.setattr(beat, "_bound_s", 0.05)
             wait_until(lambda: beat.find_hanging() == [SLOW])

@@ -111,7 +111,7 @@ def looks(segment: Segment) -> dict[str, Callable[[], object]]:
     """Return the ways in which the launcher, commands and recorders look at a rack."""
     config = read_stored(segment.config)
     joints = config.joints
-    ending = Ending(segment, None, 1000)
+    ending = Ending(segment, None, 1000, 0)
     one = Segment.attach(segment.rack)
     heartbeat = Heartbeat(segment)
     return {

@@ -70,6 +70,8 @@ class Line:
     def read_output(self) -> list[str]:
         return self.output
 
+    build_error = CrateLine.build_error
+
 
 def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tuple[list[str], str]:
     """Wait for a crate with these answers; return what was said, and why it failed."""
@@ -85,11 +87,11 @@ def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tu
 
 
 def test_each_class_has_its_own_time_limit_and_compiling_a_longer_one(clock: Clock) -> None:
-    lines, why = opened(clock, (50.0, Preloading("a:B")), (105.0, Opened()))
+    lines, why = opened(clock, (50.0, Preloading("a:B")), (105.0, Opened(-1)))
     assert why == ""
     assert lines[0] == "the crate is starting, 2 s so far"
     assert lines[-1] == "preloading 'a:B', 32 s so far"
-    lines, why = opened(clock, (0.0, Compiling("terms")), (COMPILE_S - 1.0, Opened()))
+    lines, why = opened(clock, (0.0, Compiling("terms")), (COMPILE_S - 1.0, Opened(-1)))
     assert why == ""
     assert lines[0] == "compiling 'terms', which is kept for later launches, 2 s so far"
 

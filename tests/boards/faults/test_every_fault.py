@@ -83,7 +83,7 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
     assert outcome.is_success
     restart_s = rack.config.supervision.lockstep_restart_s
     over = max(entry.until if entry.stage == Stage.OVER else 0, found)
-    if kind.ends_when_detected:
+    if kind.consequence.ends_process and not kind.once:
         over = found
     after = rows[rows["tick"] >= over + kind.compute_recovery_ticks(board, layout, restart_s)]
     assert len(after) > 20

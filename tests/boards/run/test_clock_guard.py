@@ -87,7 +87,7 @@ def test_a_clock_is_late_from_half_a_tick_on(part: float, count: int, make_bus: 
     guard = guard_of(segment)
     segment.words[System.TICK] = 4
     segment.words[System.TICK_NS] = 4 * PERIOD_NS + round(part * PERIOD_NS)
-    guard.check_release(4)
-    guard.check_release(4)
+    guard.check_release(4, 0)
+    guard.check_release(4, 0)
     rows, _ = open_alarm_ring(segment, "level").read_new_rows()
     assert [int(row["code"]) for row in rows] == [Alarm.CLOCK_LATE] * count

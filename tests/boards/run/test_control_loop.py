@@ -47,10 +47,10 @@ class Bench:
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
         if name.endswith(".planner"):
             return PlannerLoop(
-                self.segment, wiring, find_class(wiring.target, Planner)(wiring.context)
+                self.segment, wiring, find_class(wiring.target, Planner)(wiring.context), None
             )
         return VirtualControlLoop(
-            self.segment, wiring, find_class(wiring.target, Executor)(wiring.context)
+            self.segment, wiring, find_class(wiring.target, Executor)(wiring.context), None
         )
 
     def cycle(self, tick: int, *tasks: VirtualControlLoop | PlannerLoop) -> None:

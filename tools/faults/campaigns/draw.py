@@ -97,7 +97,8 @@ class RackUnderTest:
         values = tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters)
         entry = Injection(kind.number, task, box, parameters=values)
         duration = kind.compute_bound_ticks(entry, layout) or 0
-        if not kind.ends_when_detected:
+        # A fault that ends its process ends once it is detected, because the Rack then kills it.
+        if kind.once or not kind.consequence.ends_process:
             min_duration = 2 * target.cycle + target.reader if target.mailbox else MIN_TICKS
             duration = max(duration, ticks + kind.compute_tail_ticks(entry, layout), min_duration)
         recovery = kind.compute_recovery_ticks(target.board, layout, self.restart_s)

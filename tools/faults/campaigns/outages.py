@@ -48,7 +48,7 @@ def count_missing_messages(
         slots = Slots(segment, spec)
         if head := slots.box[Box.HEAD]:
             newest = slots.heads[head & slots.mask][Slot.TICK]
-            first = (spec.phase - spec.lead_ticks) % spec.every
+            first = -spec.due_offset % spec.every
             due = set(range(first, newest + 1, spec.every)) - skipped
             # A board that babbles has written more messages than were due.
             missing += max(0, len(due) - head)

@@ -215,7 +215,7 @@ class Recorder:
             else FlightRecorder(segment, retention, self._spool, self._tally)
         )
         for name, taken in self._tally.taken.items():
-            self._rings[name].resume_after(taken)
+            self._rings[name].taken = taken
         # In lockstep the machine cannot cause a deadline miss.
         self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         follower = self._words[System.FOLLOWER_PID]

@@ -46,7 +46,7 @@ class Bench:
         """Return the level with its restored state, and the command that it would send down."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == LEVEL)
         level = find_class(wiring.target, Executor)(wiring.context)
-        task = VirtualControlLoop(self.segment, wiring, level)
+        task = VirtualControlLoop(self.segment, wiring, level, None)
         assert isinstance(level, MoveTable)
         task.inputs.read(50)
         level.restore_state()
