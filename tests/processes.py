@@ -83,7 +83,7 @@ def wait_until(condition: Callable[[], object], bound_s: float = BOUND_S) -> Non
 
 
 def run_to_end(
-    command: Sequence[str | Path], bound_s: float, *, check: bool = False, **options: Any
+    command: Sequence[str | bytes | Path], bound_s: float, *, check: bool = False, **options: Any
 ) -> subprocess.CompletedProcess[str]:
     """Run a program to its end, within a bound; return its exit status and what it printed."""
     return subprocess.run(

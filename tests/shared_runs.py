@@ -59,6 +59,16 @@ def standby_run(factory: pytest.TempPathFactory) -> Path:
     return _copy(factory, "standby", 3.0, [*standbys, f"fault=[{lower}, {clock}]", soon])
 
 
+def run_text(factory: pytest.TempPathFactory, text: str, seconds: float, *settings: str) -> Path:
+    """Run the rack of a config for some time, under a name of its own; return the run's folder."""
+    folder = factory.mktemp("rack")
+    (folder / "rack.toml").write_text(text)
+    name = f"test-{folder.name}-{os.getpid()}"
+    config = load(folder / "rack.toml", [f"name={name}", *settings])
+    assert run_rack(config, seconds, folder / "run", Display()).recording == "complete"
+    return folder / "run"
+
+
 def _copy(
     factory: pytest.TempPathFactory, name: str, seconds: float, settings: Sequence[str] = ()
 ) -> Path:

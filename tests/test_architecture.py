@@ -4,6 +4,7 @@ files stay small."""
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Mapping
@@ -178,6 +179,10 @@ def test_the_ground_floor_stands_on_published_packages_alone() -> None:
     assert not (set().union(*map(packages, ground)) - allowed)
 
 
+NOT_QUICK = r"mark\.(slow|thorough|alone)"
+"""Marks of tests that `make quick` leaves out."""
+
+
 @pytest.mark.slow
 def test_every_room_has_quick_tests() -> None:
     quick: defaultdict[Path, int] = defaultdict(int)
@@ -190,7 +195,7 @@ def test_every_room_has_quick_tests() -> None:
             for test in tests
             if test.name.startswith("test_")
         ]
-        quick[path.parent] += sum("mark.slow" not in found for found in marked)
+        quick[path.parent] += sum(not re.search(NOT_QUICK, found) for found in marked)
     assert not [name_of(folder) for folder, count in quick.items() if not count]
 
 

@@ -1,4 +1,4 @@
-"""A counting rack, run by a command in lockstep and held before tick 0."""
+"""Racks that a command runs for as long as a test needs them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.boards.table_racks import counting
-from tests.processes import RACK, wait_until
+from tests.processes import RACK, start_rack, wait_until
 from tests.tools.command_line import BOUND_S, ROOT, rack
 from tests.warm import Popen
 
@@ -19,7 +19,10 @@ from tests.warm import Popen
 def held_rack(
     folder: Path, name: str, *options: str | Path
 ) -> Iterator[tuple[subprocess.Popen[bytes], Segment]]:
-    """Run a rack, by default without a recording, and yield its launcher and its segment."""
+    """Run a counting rack that is held before tick 0, by default without a recording.
+
+    Yields its launcher and its segment.
+    """
     path = folder / "counting.toml"
     path.write_text(counting(folder))
     words = ("--lockstep", "--step", "--set", f"name={name}", *(options or ("--no-record",)))
@@ -33,3 +36,19 @@ def held_rack(
             segment.close()
             process.kill()
     rack("clean")
+
+
+@contextmanager
+def running_rack(path: Path, name: str, *words: str) -> Iterator[str]:
+    """Run the rack of a config that has no end, without a recording.
+
+    Yields its name once it has begun to tick, and stops it at the end.
+    """
+    command = [*RACK, "run", path, "--no-record", f"--set=name={name}", *words]
+    process = start_rack(command, name, path.with_name(f"{name}.log"))
+    try:
+        yield name
+    finally:
+        rack("stop", name)
+        process.kill()
+        process.wait()

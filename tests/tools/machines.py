@@ -12,14 +12,11 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import build_row_dtype
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
-from rack.boards.config import RackConfig, load, resolve_layout
+from rack.boards.config import load, resolve_layout
 from rack.levels.peer import DRIFT_PPM, Presence, format_peer_port
-from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.cores import UNMEASURED
-from rack.tools.recording.parquet import CyclesFile, create_signal_tables
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import TABLE_PATTERNS
 from tests.boards.lan.racks import rack_text
+from tests.tools.recordings import recorded as write_recording
 
 S, MS, US = 1_000_000_000, 1_000_000, 1_000
 CLOCK_NS = 2_500_000
@@ -64,49 +61,38 @@ class Machine:
         return max(0, (self.shows(true_ns) - self.epoch_ns) * self.speed)
 
 
-def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConfig:
-    folder.mkdir(parents=True)
-    path = folder / "rack.toml"
-    heard = others[0] if others and machine.mode == "lockstep" else ""
-    path.write_text(rack_text(machine.rack, "tcp/127.0.0.1:7447", (), heard, peers=others))
-    return load(str(path), [f"clock.mode={machine.mode}", f"clock.speed={machine.speed}"])
-
-
 def recorded(machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1) -> Recording:
     """Write the recording of a rack that compared its clock with those of others, each time with an
     error.
 
     In lockstep it counts, and takes the count of the others, each 4 ticks late.
     """
-    config = config_of(machine, [other.rack for other in others], folder)
-    (folder / "config.toml").write_text(config.to_toml_text())
+    names = [other.rack for other in others]
+    heard = names[0] if names and machine.mode == "lockstep" else ""
+    path = folder / "rack.toml"
+    folder.mkdir(parents=True)
+    path.write_text(rack_text(machine.rack, "tcp/127.0.0.1:7447", (), heard, peers=names))
+    config = load(str(path), [f"clock.mode={machine.mode}", f"clock.speed={machine.speed}"])
     layout = resolve_layout(config)
-    launch = Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
-    cycles = CyclesFile(folder / "cycles.parquet", layout, launch)
-    rows = np.zeros(TICKS, RECORD)
-    rows["tick"] = np.arange(TICKS)
+    trace = np.zeros(TICKS, RECORD)
+    trace["tick"] = np.arange(TICKS)
     for name in ("release_ns", "start_ns", "read_ns", "process_ns", "end_ns"):
-        rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
-    cycles.add_records("pulse", rows)
-    cycles.close({}, UNMEASURED, (), ())
-    signals = create_signal_tables(folder / "signals", layout)
-    for other in others:
-        box = layout.find_mailbox(f"lan.{format_peer_port(other.rack)}")
-        signals[box.name].add_rows(sightings(machine, other, box, seed))
+        trace[name] = machine.epoch_ns + trace["tick"] * machine.period_ns
+    boxes = [layout.find_mailbox(f"lan.{format_peer_port(other.rack)}") for other in others]
+    messages = {
+        box.name: sightings(machine, other, box, seed)
+        for box, other in zip(boxes, others, strict=True)
+    }
     if machine.mode == "lockstep":
-        for name, ticks in (
-            ("pulse.status", TICKS),
-            *([("lan.other", TICKS - 4)] if others else []),
-        ):
-            rows = np.zeros(ticks // 4, build_row_dtype(layout.find_mailbox(name)))
-            rows["basis"] = np.arange(0, ticks, 4)
-            rows["tick"] = rows["basis"] + TICKS - ticks
+        late = {"lan.other": 4} if others else {}
+        for name, ticks in {"pulse.status": 0, **late}.items():
+            rows = np.zeros((TICKS - ticks) // 4, build_row_dtype(layout.find_mailbox(name)))
+            rows["basis"] = np.arange(0, TICKS - ticks, 4)
+            rows["tick"] = rows["basis"] + ticks
             rows["message"]["count"] = rows["basis"]
-            signals[name].add_rows(rows)
-    for table in signals.values():
-        table.close()
-    Checksums(folder).store("config.toml", *TABLE_PATTERNS)
-    return Recording(folder)
+            messages[name] = rows
+    launch = Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
+    return write_recording(folder, config, {"pulse": trace}, messages=messages, launch=launch)
 
 
 def sightings(machine: Machine, other: Machine, box: MailboxSpec, seed: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, resolve_layout
+from rack.boards.events import Event, EventKind
 from rack.tools.recording.checksums import Checksums, format_checked_line
 from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, create_signal_tables
@@ -20,7 +22,9 @@ from rack.tools.recording.run_files import TABLE_PATTERNS
 MS, US = 1_000_000, 1_000
 EPOCH_NS = 5_000_000_123
 """Time of tick 0 in the rows of `cycle`."""
+LAUNCH = Launch(EPOCH_NS, EPOCH_NS)
 Row = tuple[int, ...]
+Traces = Mapping[str, "Sequence[Cycle | Row] | np.ndarray"]
 
 
 class Cycle(NamedTuple):
@@ -61,9 +65,10 @@ def cycle(
 def recorded(
     folder: Path,
     config: RackConfig,
-    traces: Mapping[str, Sequence[Cycle | Row]],
+    traces: Traces,
     events: Sequence[Mapping[str, Any]] = (),
     messages: Mapping[str, np.ndarray] | None = None,
+    launch: Launch = LAUNCH,
 ) -> Recording:
     """Write the recording of a rack with these traces and messages into `folder`, and return it."""
     folder.mkdir(exist_ok=True)
@@ -72,7 +77,7 @@ def recorded(
         "".join(format_checked_line({**event}) for event in events)
     )
     layout = resolve_layout(config)
-    cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
+    cycles = CyclesFile(folder / "cycles.parquet", layout, launch)
     signals = create_signal_tables(folder / "signals", layout)
     for task, trace in traces.items():
         rows = [cycle.row(config.tick_ns) if isinstance(cycle, Cycle) else cycle for cycle in trace]
@@ -84,3 +89,11 @@ def recorded(
         table.close()
     Checksums(folder).store("config.toml", *TABLE_PATTERNS)
     return Recording(folder)
+
+
+def add_events(folder: Path, *events: tuple[int, EventKind, str, str]) -> None:
+    """Add events of the lower board to a recording: tick, kind, code and text of each."""
+    with (folder / "events.jsonl").open("a") as file:
+        for tick, kind, code, text in events:
+            event = Event(0, tick, kind, "lower", text, code)
+            file.write(format_checked_line(asdict(event)))

@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from subprocess import CompletedProcess
 
 import pytest
 
 from rack.tools.cli import COMMANDS
 from rack.tools.commands.export import EXPORTERS
-from tests.processes import RACK
+from tests.processes import RACK, run_to_end
 from tests.tools.command_line import BOUND_S, ROOT, rack, read_refusal
 from tests.warm import run_command
 
@@ -25,20 +24,9 @@ RUN_FIG2 = ("run", "fig2", "--lockstep", "--no-record")
 NAMES = [name for found in COMMANDS.values() for name in found]
 
 
-def run_process(
-    line: Sequence[str | bytes], stdout: int | IO[bytes] = subprocess.PIPE, **environment: str
-) -> subprocess.CompletedProcess[str]:
+def run_process(line: Sequence[str | bytes], **environment: str) -> CompletedProcess[str]:
     """Run a command as a process."""
-    return subprocess.run(
-        line,
-        cwd=ROOT,
-        env=os.environ | environment,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
+    return run_to_end(line, BOUND_S, cwd=ROOT, env=os.environ | environment)
 
 
 @pytest.mark.parametrize(
@@ -88,9 +76,7 @@ def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
     return [("list",), ("check", "fig2", "--json"), ("status", rack_name, "--json"), run]
 
 
-def printed_to(
-    stdout: int, arguments: tuple[str, ...], unbuffered: str
-) -> subprocess.CompletedProcess[str]:
+def printed_to(stdout: int, arguments: tuple[str, ...], unbuffered: str) -> CompletedProcess[str]:
     """Run a command that prints to a descriptor."""
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     return run_command([*RACK, *arguments], BOUND_S, stdout=stdout, env=environment, text=True)
@@ -198,11 +184,8 @@ def test_bytes_that_are_not_utf_8_are_refused() -> None:
     [("rack che", "check"), ("rack check fig", "fig2\nfig3\nfig4\nfig4-overload")],
 )
 def test_the_shell_completes_commands_and_configs(words: str, found: str) -> None:
-    asked = {
-        "_RACK_COMPLETE": "complete_bash",
-        "COMP_WORDS": words,
-        "COMP_CWORD": str(len(words.split()) - 1),
-    }
+    place = str(len(words.split()) - 1)
+    asked = {"_RACK_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": place}
     done = run_process(RACK, **asked)
     assert (done.returncode, done.stdout.strip()) == (0, found)
 

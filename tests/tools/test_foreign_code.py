@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +17,10 @@ from rack.backplane.segment import Segment, list_racks
 from rack.boards.faults import KINDS
 from rack.tools.cli import COMMANDS
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.processes import RACK, start_rack, wait_until
-from tests.tools.command_line import BOUND_S, rack, read_refusal
-from tests.warm import Popen, run_command
+from tests.processes import RACK, run_to_end, wait_until
+from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal, started
+from tests.tools.held_racks import running_rack
+from tests.warm import run_command
 
 MODULE = "spy_levels"
 SPY = '''
@@ -128,41 +128,26 @@ def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
     folder = tmp_path_factory.mktemp("somebody")
     own = tmp_path_factory.mktemp("levels")
     (own / f"{MODULE}.py").write_text(SPY)
-    path = folder / "spied.toml"
+    path, run, marker = folder / "spied.toml", folder / "run", own / f"{MODULE}.imported"
     text = COMMANDED.replace("commanded_levels:Lower", f"{MODULE}:Homing")
     text = text.replace("commanded_levels:Upper", f"{MODULE}:Upper")
     path.write_text(text.replace("python_path = [", f'python_path = ["{own}", '))
-    marker = own / f"{MODULE}.imported"
-    run = folder / "run"
-    name = f"test-spied-{os.getpid()}"
-    command = [*RACK, "run", str(path), "--share"]
+    given = ("--share", *(f"--set=board.{board}.budget.process_ms=0.1" for board in BOARDS))
     fault = 'fault=[{ kind = "spy-drop", board = "lower", tick = 200, cycles = 2 }]'
-    command = [*command, *(f"--set=board.{board}.budget.process_ms=0.1" for board in BOARDS)]
     short = ("--lockstep", "--seconds", "1", "--out", str(run), "--json")
-    recorded = [*command, *short, f"--set={fault}", f"--set={HOLD}"]
+    recorded = [*RACK, "run", str(path), *given, *short, f"--set={fault}", f"--set={HOLD}"]
     done = run_command(recorded, BOUND_S, text=True)
     assert done.returncode == 0, done.stderr
     # The command, its crate and others.
     assert marker.read_text()
     # In lockstep a rack writes faster than `rack watch` may read.
+    name = f"test-spied-{os.getpid()}"
     modes = {name: "--set=clock.mode=realtime", f"{name}-steps": "--lockstep"}
     with ExitStack() as stack:
         for one, mode in modes.items():
-            log = folder / f"{one}.log"
-            stack.enter_context(_launched(one, [*command, f"--set=name={one}", mode], log))
+            stack.enter_context(running_rack(path, one, *given, mode))
         marker.unlink()
         yield Spied(*modes, run, marker)
-
-
-@contextmanager
-def _launched(name: str, command: Sequence[str], log: Path) -> Iterator[None]:
-    """Run a rack that has begun to tick, and end it."""
-    process = start_rack([*command, "--no-record"], name, log)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait(BOUND_S)
 
 
 @pytest.fixture
@@ -211,21 +196,17 @@ def test_a_program_that_attaches_imports_nothing_that_a_config_names(guarded: Sp
 @pytest.mark.slow
 def test_a_report_made_again_knows_kinds_that_levels_add(guarded: Spied) -> None:
     (guarded.run / "report.json").unlink()
-    done = rack("report", guarded.run, "--json")
-    (fault,) = json.loads(done.stdout)["faults"]
+    (fault,) = read_answer("report", guarded.run)["faults"]
     assert (fault["kind"], fault["seen"], fault["found_as"]) == ("spy-drop", "detected", "gap")
     published = guarded.run / "published.json"
     text = published.read_text()
+    KINDS._by_number.pop(KINDS.names.pop("spy-drop").number)
     try:
-        for is_there, said in (
-            (True, "published.json: damaged"),
-            (False, "unknown kind 'spy-drop'"),
+        for place, said in (
+            (lambda: published.write_text("{}"), "published.json: damaged"),
+            (published.unlink, "unknown kind 'spy-drop'"),
         ):
-            kind = KINDS.names.pop("spy-drop", None)
-            KINDS._by_number.pop(kind.number if kind else 0, None)
-            published.unlink()
-            if is_there:
-                published.write_text("{}")
+            place()
             (guarded.run / "report.json").unlink(missing_ok=True)
             assert said in read_refusal(rack("report", guarded.run))
     finally:
@@ -245,50 +226,36 @@ def test_a_prompt_is_refused_on_a_rack_of_another_user(guarded: Spied) -> None:
     assert "belongs to user 4711" in read_refusal(done, status=1)
 
 
-def has_attached(pid: int, rack_name: str) -> bool:
-    """Return whether a process has mapped the segment of a rack."""
-    return rack_name in Path(f"/proc/{pid}/maps").read_text()
-
-
 @pytest.mark.slow
 def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -> None:
     environment = {**os.environ, "PYTHONPATH": str(guarded.marker.parent), "FOXGLOVE_PORT": "0"}
-    started = {
-        command: Popen(
-            [*RACK, command, *map(str, arguments(guarded))],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for command, arguments in AS_PROCESSES.items()
-    }
-    try:
+    with ExitStack() as stack:
+        processes = {
+            command: stack.enter_context(
+                started(command, *arguments(guarded), env=environment, stderr=subprocess.STDOUT)
+            )
+            for command, arguments in AS_PROCESSES.items()
+        }
         spool = guarded.run.parent / "recorded" / "published.json"
         wait_until(spool.exists)
-        wait_until(lambda: all(has_attached(one.pid, guarded.rack) for one in started.values()))
+        maps = [Path(f"/proc/{process.pid}/maps") for process in processes.values()]
+        # All have mapped the rack's segment.
+        wait_until(lambda: all(guarded.rack in path.read_text() for path in maps))
         stopped = rack("stop", guarded.rack, "--wait", BOUND_S)
         assert stopped.returncode == 0, stopped.stderr
-        for command, process in started.items():
+        for command, process in processes.items():
             printed, _ = process.communicate(timeout=BOUND_S)
             assert process.returncode == 0, (command, printed)
-    finally:
-        for process in started.values():
-            process.kill()
-            process.communicate()
     assert guarded.rack not in list_racks()
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_file_in_the_current_folder_is_no_module_of_a_crate_or_a_recorder(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     (tmp_path / "numpy.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")
     safe = [sys.executable, "-P", *RACK[1:]]
     given = ["--set", f"name={rack_name}", "--seconds", "0.1", "--out", tmp_path / "run"]
-    done = subprocess.run(
-        [*safe, "run", small, *given], cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S
-    )
+    done = run_to_end([*safe, "run", small, *given], BOUND_S, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "imported").exists()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import pty
 import re
@@ -17,10 +16,9 @@ import pytest
 
 from rack.tools.cli import COMMANDS
 from rack.tools.console.answer import PIPE_WIDTH
-from tests.processes import RACK
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.processes import RACK, run_to_end
+from tests.tools.command_line import BOUND_S, ROOT, rack, read_answer, started
 from tests.tools.held_racks import held_rack
-from tests.warm import Popen
 
 NAMES = [name for commands in COMMANDS.values() for name in commands]
 IDLE = (
@@ -79,10 +77,7 @@ def words_of(
     """What the words of a command line stand for, relative to the folder of the test."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run").symlink_to(run)
-    (tmp_path / "rack.toml").write_text(small.read_text())
-    for path in small.parent.glob("*.py"):
-        (tmp_path / path.name).write_text(path.read_text())
-    return {"SMALL": "rack.toml", "RUN": "run", "FOLDER": ".", "LAW": "my_law"}
+    return {"SMALL": small.name, "RUN": "run", "FOLDER": ".", "LAW": "my_law"}
 
 
 def fill_in(line: str, words: dict[str, str]) -> list[str]:
@@ -121,15 +116,11 @@ def test_a_pipe_gets_no_wide_line(line: str, words_of: dict[str, str], tmp_path:
 def print_into_closed_pipe(arguments: list[str]) -> subprocess.CompletedProcess[str]:
     """Run a command whose reader closes the pipe after its first line, as `head -1` does."""
     reader, writer = os.pipe()
-    with Popen([*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True) as process:
+    with started(*arguments, stdin=None, stdout=writer, cwd=None) as process:
         os.close(writer)
-        try:
-            os.read(reader, 1)
-            os.close(reader)
-            _, errors = process.communicate(timeout=BOUND_S)
-        finally:
-            # A test that is over its time would wait for it for ever.
-            process.kill()
+        os.read(reader, 1)
+        os.close(reader)
+        _, errors = process.communicate(timeout=BOUND_S)
     return subprocess.CompletedProcess(arguments, process.returncode, "", errors)
 
 
@@ -160,13 +151,8 @@ def show_on_terminal(arguments: list[str], columns: int) -> str:
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     hidden = ("COLUMNS", "LINES")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
-    with Popen(
-        [*RACK, *arguments],
-        cwd=ROOT,
-        stdout=terminal,
-        stderr=subprocess.PIPE,
-        env=environment | {"NO_COLOR": "1", "TERM": "xterm"},
-    ) as process:
+    environment |= {"NO_COLOR": "1", "TERM": "xterm"}
+    with started(*arguments, stdin=None, stdout=terminal, env=environment) as process:
         os.close(terminal)
         printed = b""
         try:
@@ -175,7 +161,7 @@ def show_on_terminal(arguments: list[str], columns: int) -> str:
         except OSError:
             # The command has closed the terminal.
             pass
-        assert b"Traceback" not in process.communicate(timeout=BOUND_S)[1], arguments
+        assert "Traceback" not in process.communicate(timeout=BOUND_S)[1], arguments
     os.close(screen)
     return printed.decode().replace("\r\n", "\n")
 
@@ -198,13 +184,9 @@ def test_a_pipe_gets_no_wide_line_about_a_running_rack(held: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
-    [
-        ("status NAME", "step NAME 2", "command NAME --list", "top NAME"),
-        LIVE,
-    ],
+    [("status NAME", "step NAME 2", "command NAME --list", "top NAME"), LIVE],
     ids=["some", "all"],
 )
 def test_a_closed_pipe_causes_no_traceback_while_a_rack_runs(
@@ -217,7 +199,6 @@ def test_a_closed_pipe_causes_no_traceback_while_a_rack_runs(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
     [
@@ -240,15 +221,8 @@ def test_a_terminal_of_40_columns_gets_a_narrower_layout_without_colours(
 
 def test_output_without_unicode_shows_bars_and_no_traceback() -> None:
     environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}
-    done = subprocess.run(
-        [*RACK, "check", "fig3"],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        timeout=BOUND_S,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (1, b"")
-    assert b"core 1  [################] 105.6%  level 67%, level.planner 39%" in done.stdout
-    document = json.loads(rack("check", "fig3", "--json").stdout)
+    done = run_to_end([*RACK, "check", "fig3"], BOUND_S, cwd=ROOT, env=environment)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert "core 1  [################] 105.6%  level 67%, level.planner 39%" in done.stdout
+    document = read_answer("check", "fig3", status=1)
     assert document["timing"]["loads"]["1"] > 1.0

@@ -3,40 +3,24 @@ measured."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
+from tests.shared_runs import run_text
 from tests.tools.command_line import rack, read_answer
 
 TOGETHER = "path > joint1 ... joint3 > arm"
 
 
 @pytest.fixture
-def jointed(tmp_path: Path) -> Path:
+def jointed(write: Callable[[str, str], Path]) -> Path:
     """The rack as a file."""
-    path = tmp_path / "jointed.toml"
-    path.write_text(JOINTED)
-    return path
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recorded run in lockstep in which an operator held the highest level."""
-    path = tmp_path_factory.mktemp("jointed")
-    (path / "jointed.toml").write_text(JOINTED)
-    held = commands(
-        "level = 'path', what = 'hold', tick = 101", "level = 'path', what = 'resume', tick = 160"
-    )
-    config = load(path / "jointed.toml", [f"name=test-{path.name}", held])
-    assert run_rack(config, 0.6, path / "run", Display()).recording == "complete"
-    return path / "run"
+    return write("jointed.toml", JOINTED)
 
 
 def test_a_check_has_one_line_for_boards_with_equal_figures(jointed: Path) -> None:
@@ -61,8 +45,13 @@ def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path)
 
 
 @pytest.mark.slow
-def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
-    report, text = write_report(folder)
+def test_the_response_is_measured_along_every_chain(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    # In lockstep, while an operator holds the highest level for a while.
+    held = (("hold", 101), ("resume", 160))
+    given = (f"level = 'path', what = '{what}', tick = {tick}" for what, tick in held)
+    report, text = write_report(run_text(tmp_path_factory, JOINTED, 0.6, commands(*given)))
     response = report["system_response"]
     assert (response["levels"], response["others"]) == (["path", "joint1 ... joint3", "arm"], [])
     # 20 + 2.5 + 2.5 ms down; up, a status waits for up to 7 ticks more.

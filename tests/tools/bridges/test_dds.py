@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Iterator
@@ -15,10 +14,10 @@ from rack.backplane.lines import UtilityLines
 from rack.tools.monitor.newest_messages import NewestMessages
 from tests.processes import runs, wait_until
 from tests.tools.bridges.ros_racks import HeldRack, Peer, dds_peer, held_rack
-from tests.tools.command_line import BOUND_S, rack, read_refusal
+from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has no wheel for this Python")
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 PUMA = ["j1", "j2", "j3", "j4", "j5", "j6"]
 WORDS = ("chimera", "--set", "host.command.external=true", "--ros2", "--no-record")
 
@@ -107,12 +106,8 @@ def test_an_unknown_transport_is_refused(
 def test_a_rack_with_a_bridge_has_the_same_digest(
     peer: Peer, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("nasrem", "--lockstep", "--seconds", "0.5", "--no-record", "--json")
-
-    def run(*bridges: str) -> str:
-        done = rack("run", *words, *bridges, "--set", f"name={rack_name}")
-        return str(json.loads(done.stdout)["outcome"]["digest"])
-
     for name, value in peer.environment.items():
         monkeypatch.setenv(name, value)
-    assert run("--ros2") == run()
+    words = ("nasrem", "--lockstep", "--seconds", "0.5", "--no-record", f"--set=name={rack_name}")
+    bridged, plain = read_answer("run", *words, "--ros2"), read_answer("run", *words)
+    assert bridged["outcome"]["digest"] == plain["outcome"]["digest"]

@@ -20,7 +20,7 @@ from rack.tools.monitor.newest_messages import NewestMessages
 from tests.pages import ROOT
 from tests.processes import runs, wait_until
 from tests.tools.bridges.ros_racks import HeldRack, Peer, held_rack, ros_peer
-from tests.tools.command_line import BOUND_S, rack
+from tests.tools.command_line import BOUND_S, read_answer
 
 pytestmark = pytest.mark.slow
 PUMA = ["j1", "j2", "j3", "j4", "j5", "j6"]
@@ -169,8 +169,11 @@ def test_trajectories_move_an_arm_and_are_replayed_and_mistakes_are_one_line_eac
         held.step(200)
         assert runs(held.find_bridge())
         assert newest.read_message("trajectory.status").done == status.done
-    (repeated,) = repeat(run, tmp_path)
-    assert repeated == json.loads((run / "report.json").read_text())["outcome"]["digest"]
+    # A run that takes the messages of its host boards from the first one.
+    outcome = json.loads((run / "report.json").read_text())["outcome"]
+    words = ("--lockstep", "--entries", run, "--seconds", outcome["ticks"] * 0.002, "--no-record")
+    repeated = read_answer("run", run / "config.toml", *words)
+    assert repeated["outcome"]["digest"] == outcome["digest"]
 
 
 def insist(held: HeldRack, peer: Peer, text: str, do: str, **request: Any) -> None:
@@ -181,11 +184,3 @@ def insist(held: HeldRack, peer: Peer, text: str, do: str, **request: Any) -> No
         return text in held.log.read_text()
 
     wait_until(has_printed, BOUND_S)
-
-
-def repeat(run: Path, folder: Path) -> list[str]:
-    """Return the digest of a run that takes the messages of its host boards from `run`."""
-    ticks = json.loads((run / "report.json").read_text())["outcome"]["ticks"]
-    words = ("--lockstep", "--entries", run, "--seconds", ticks * 0.002, "--json", "--no-record")
-    done = rack("run", run / "config.toml", *words)
-    return [json.loads(done.stdout)["outcome"]["digest"]]

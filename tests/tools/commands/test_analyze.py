@@ -15,11 +15,12 @@ from rack.tools.monitor.display import Display
 from rack.tools.report.analysis import Analysis
 from tests.tools.analysis_text import brief, text
 from tests.tools.command_line import rack
-from tests.tools.recordings import MS, Cycle, recorded
+from tests.tools.conftest import Record
+from tests.tools.recordings import MS, Cycle
 
 MISSED, SKIPPED = int(Flag.MISSED), int(Flag.SKIPPED)
 SETTLED = 40
-PLAIN = (0.0, 0.1, 1.0, 0.1)
+PLAIN, LONG = (0.0, 0.1, 1.0, 0.1), (0.0, 0.1, 2.6, 0.1)
 BUDGET = [
     "board.lower.budget.process_ms=1.0",
     "board.lower.budget.read_ms=0.2",
@@ -27,15 +28,6 @@ BUDGET = [
 ]
 USUAL = ["--percentile", "50"]
 """What a machine whose host stalls it cannot change."""
-
-
-def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
-    """Return the verdict of each equation and subject, on one side of the document."""
-    return {
-        (row["equation"], row["subject"]): row[side]["holds"]
-        for row in found["equations"]
-        if row[side] is not None
-    }
 
 
 JUDGED = {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load", "core 1")}
@@ -53,7 +45,11 @@ def test_a_run_confirms_the_prediction_for_its_rack(
     assert (done.returncode, found["holds"]) == (0 if holds else 1, holds), done.stderr
     assert json.loads((tmp_path / "out" / "analysis.json").read_text()) == found
     for side in ("predicted", "measured"):
-        seen = verdicts(found, side)
+        seen = {
+            (row["equation"], row["subject"]): row[side]["holds"]
+            for row in found["equations"]
+            if row[side] is not None
+        }
         assert all(seen[key] is holds for key in JUDGED)
         assert not holds or all(seen.values())
     if holds:
@@ -73,13 +69,12 @@ def test_a_run_confirms_the_prediction_for_its_rack(
     ],
 )
 def test_the_verdict_comes_first_and_tables_only_on_demand(
-    small: Path, tmp_path: Path, outcome: dict[str, Any], missed: int, to_do: str
+    record: Record, outcome: dict[str, Any], missed: int, to_do: str
 ) -> None:
-    config = load(small, ["clock.mode=realtime", *BUDGET])
     counts = {"missed": missed, "skipped": 2 * (missed > 0)}
     ended = {"kind": "outcome", "outcome": outcome, "tasks": {"lower": counts}}
     traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(40)] for name in ("lower", "upper")}
-    folder = recorded(tmp_path / "run", config, traces, [ended]).folder
+    folder = record(traces, *BUDGET, events=[ended]).folder
     done = rack("analyze", folder)
     assert (done.returncode, done.stderr) == (0, "")
     found = done.stdout.splitlines()
@@ -95,15 +90,11 @@ def test_the_verdict_comes_first_and_tables_only_on_demand(
     assert [any("Equations: " in line for line in lines) for lines in (found, more)] == [0, 1]
 
 
-def test_differences_between_prediction_and_measurement_are_marked(
-    small: Path, tmp_path: Path
-) -> None:
-    config = load(small, ["clock.mode=realtime", *BUDGET])
-    trace = [
-        Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7))
-        for k in range(40)
-    ]
-    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": trace}))
+def test_differences_between_prediction_and_measurement_are_marked(record: Record) -> None:
+    trace = [Cycle(SETTLED + k, PLAIN) for k in range(40)]
+    trace[7] = Cycle(SETTLED + 7, LONG, flags=MISSED)
+    recording = record({"lower": trace}, *BUDGET)
+    analysis = Analysis.from_recording(recording)
     differing = {pair.equation for pair in analysis.pairs if pair.is_contradicted}
     assert differing >= {"3.1", "3.6", "response time"}
     assert not analysis.is_fulfilled
@@ -114,17 +105,16 @@ def test_differences_between_prediction_and_measurement_are_marked(
     assert failed[0] == "  lower, eq. 3.6: 0 < -0.3 ms fails"
     assert "  lower, eq. 3.1: 2.8 of 2.5 ms, 12% too much" in failed
     assert "not as predicted: lower 3.1" in found
-    assert f"to do: rack check CONFIG --from {tmp_path / 'run'} lists changes" in found
+    assert f"to do: rack check CONFIG --from {recording.folder} lists changes" in found
     levels = [line.split()[:5] for line in found.splitlines() if line.startswith("lower  ")]
     assert ["lower", "predicted", "2.5", "1", "0.4"] in levels
     assert ["lower", "measured", "2.5", "2.6", "0.2"] in levels
     assert "never ran: upper\nmade no plan: lower\n" in found
 
 
-def test_a_rare_stall_fails_only_the_worst_cycle(small: Path, tmp_path: Path) -> None:
-    config = load(small, ["clock.mode=realtime", *BUDGET])
-    trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1)) for k in range(400)]
-    recording = recorded(tmp_path / "run", config, {"lower": trace})
+def test_a_rare_stall_fails_only_the_worst_cycle(record: Record) -> None:
+    trace = [Cycle(SETTLED + k, LONG if k == 7 else PLAIN) for k in range(400)]
+    recording = record({"lower": trace}, *BUDGET)
     analysis = Analysis.from_recording(recording)
     assert not analysis.is_fulfilled
     assert "failed in more than 1 of 100 cycles: none" in text(analysis)
@@ -158,11 +148,11 @@ def test_a_rare_stall_fails_only_the_worst_cycle(small: Path, tmp_path: Path) ->
     ],
 )
 def test_the_equations_are_applied_to_the_worst_cycle(
-    small: Path, tmp_path: Path, last: Cycle, mode: str, broken: dict[str, tuple[float, float]]
+    record: Record, last: Cycle, mode: str, broken: dict[str, tuple[float, float]]
 ) -> None:
-    config = load(small, [f"clock.mode={mode}", "timing.context_switch_ms=0.1"])
     trace = [*(Cycle(SETTLED + k, PLAIN) for k in range(8)), last, Cycle(SETTLED + 15, PLAIN)]
-    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": trace}))
+    settings = (f"clock.mode={mode}", "timing.context_switch_ms=0.1")
+    analysis = Analysis.from_recording(record({"lower": trace}, *settings))
     found = {
         pair.equation: (pair.measured.left / MS, pair.measured.right / MS)
         for pair in analysis.pairs
@@ -171,11 +161,8 @@ def test_the_equations_are_applied_to_the_worst_cycle(
     assert found == {name: pytest.approx(sides, abs=1e-6) for name, sides in broken.items()}
 
 
-def test_a_late_level_whose_times_fit_is_not_referred_to_the_check(
-    small: Path, tmp_path: Path
-) -> None:
-    config = load(small, ["clock.mode=realtime", *BUDGET])
+def test_a_late_level_whose_times_fit_is_not_referred_to_the_check(record: Record) -> None:
     late = [Cycle(SETTLED + k, PLAIN, late=3.0) for k in range(40)]
-    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": late}))
+    analysis = Analysis.from_recording(record({"lower": late}, *BUDGET))
     assert not analysis.is_fulfilled
     assert "to do: nothing about the config: its levels' own times fit" in brief(analysis)

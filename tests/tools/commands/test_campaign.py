@@ -37,14 +37,9 @@ class Stalling(Upper):
 """
 
 
-def campaign(config: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return rack("campaign", config, *arguments)
-
-
 LOCKSTEP = ("--lockstep", "--injections", "2", "--seed", "4", "--seconds", "9", "--json")
 
 
-@pytest.mark.slow
 def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
     small: Path, tmp_path: Path
 ) -> None:
@@ -58,7 +53,7 @@ def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
         finally:
             process.kill()
     there = {path.name: path.stat().st_mtime_ns for path in trials.glob("*.json")}
-    done = campaign(small, *options)
+    done = rack("campaign", small, *options)
     report = json.loads(done.stdout)
     assert (done.returncode, done.stderr, report["shortfalls"]) == (0, "", [])
     # What was done is not done again.
@@ -77,7 +72,6 @@ def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
     assert not list(out.glob("*.toml"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [(signal.SIGTERM,), (signal.SIGINT,) * 2])
 def test_a_signal_ends_launching_trials_and_keeps_finished_ones(
     small: Path, write: Callable[[str, str], Path], tmp_path: Path, numbers: tuple[int, ...]
@@ -127,11 +121,10 @@ def semaphores_of_python() -> set[str]:
     return {path.name for path in SHM_FOLDER.glob("sem.mp-*")}
 
 
-@pytest.mark.slow
 def test_boards_killed_from_outside_are_detected_and_restarted(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
-    done = campaign(small, "--lockstep", "--kills", "3", "--seconds", "12", "--out", out, "--json")
-    summary = json.loads(done.stdout)["summary"]
+    options = ("--lockstep", "--kills", "3", "--seconds", "12", "--out", out, "--json")
+    summary = json.loads(rack("campaign", small, *options).stdout)["summary"]
     # How fast the Rack hears of a death depends on how busy this machine is.
     assert summary["injected"] == summary["detected"] == summary["recovered"] == 3
     assert (summary["left_behind"], summary["unexplained"]) == (0, 0)
@@ -160,4 +153,4 @@ def test_boards_killed_from_outside_are_detected_and_restarted(small: Path, tmp_
 def test_bad_input_is_refused_in_one_line_with_valid_values(
     small: Path, options: list[str], line: str
 ) -> None:
-    assert line in read_refusal(campaign(small, *options))
+    assert line in read_refusal(rack("campaign", small, *options))

@@ -11,7 +11,6 @@ import json
 import os
 import random
 import signal
-import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,8 +22,8 @@ import pytest
 
 from rack.boards.config import CONFIGS, list_names, load
 from rack.boards.config.toml import to_toml
-from rack.tools.cli import run_commands
 from rack.tools.console.answer import MAX_LINE
+from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.thorough
 
@@ -129,40 +128,28 @@ def bounded() -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
-
-
-def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    """Run `rack check --json` in this process, and return its exit status and answer."""
-    capsys.readouterr()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["rack", "check", *arguments, "--json"])
-        with bounded(), pytest.raises(SystemExit) as ended:
-            run_commands()
-    document = json.loads(capsys.readouterr().out, parse_constant=no_constant)
-    return int(ended.value.code or 0), document
+def check(*arguments: str) -> tuple[int, dict[str, Any]]:
+    """Run `rack check --json` in a bounded time, and return its exit status and answer."""
+    with bounded():
+        done = rack("check", *arguments, "--json")
+    return done.returncode, json.loads(done.stdout, parse_constant=pytest.fail)
 
 
 def judge(status: int, document: dict[str, Any]) -> None:
     if status == 2:
-        assert document["error"]
-        assert all(
-            line and line.isprintable() and len(line) <= MAX_LINE for line in document["error"]
-        )
+        lines = document["error"]
+        assert lines
+        assert all(line and line.isprintable() and len(line) <= MAX_LINE for line in lines)
     else:
         assert status == (0 if document["timing"]["holds"] else 1)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)  # a machine that is shared: the bound is processor time
-def test_a_mutated_config_gets_an_answer_in_time(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mutated_config_gets_an_answer_in_time(tmp_path: Path) -> None:
     path, seen = tmp_path / "spoilt.toml", set()
     for seed in range(FIRST, FIRST + EXAMPLES):
         path.write_text(spoilt(random.Random(seed)))
-        status, document = check(capsys, str(path))
+        status, document = check(str(path))
         judge(status, document)
         seen.add(status)
     assert {0, 2} <= seen, "few of the configs do not fit: 1 is rare"
@@ -183,25 +170,20 @@ ATTACKS = {
 }
 
 
-@pytest.mark.parametrize(("rack", "setting", "place"), ATTACKS.values(), ids=ATTACKS)
+@pytest.mark.parametrize(("name", "setting", "place"), ATTACKS.values(), ids=ATTACKS)
 def test_configs_that_once_hung_or_crashed_the_check_are_mistakes(
-    capsys: pytest.CaptureFixture[str], rack: str, setting: str, place: str
+    name: str, setting: str, place: str
 ) -> None:
-    status, document = check(capsys, rack, "--set", setting)
+    status, document = check(name, "--set", setting)
     judge(status, document)
     assert [line.startswith(f"{place} ") for line in document["error"]] == [True]
 
 
-def test_the_longest_possible_cycles_and_plans_are_judged_in_time(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    settings = ("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000")
-    slow = (
-        "board.level.core=0",
-        "board.level.within_cycles=10000",
+def test_the_longest_possible_cycles_and_plans_are_judged_in_time() -> None:
+    settings = (
+        *("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000"),
+        *("board.level.core=0", "board.level.within_cycles=10000"),
         "board.level.budget.process_ms=0.5",
     )
-    status, document = check(
-        capsys, "fig2", *(word for setting in (*settings, *slow) for word in ("--set", setting))
-    )
+    status, document = check("fig2", *(f"--set={setting}" for setting in settings))
     assert (status, document["timing"]["holds"]) == (1, False)

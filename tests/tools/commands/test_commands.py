@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,41 +16,24 @@ from rack.backplane.segment import list_racks
 from rack.boards import Rack
 from rack.boards.config import RackConfig
 from rack.tools.console.interrupt import list_descendants
-from tests.processes import RACK, is_ticking, runs, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack
-from tests.warm import Popen, run_command
+from tests.processes import RACK, is_ticking, run_to_end, runs, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack, read_answer, read_refusal, started
+from tests.warm import run_command
 
 
 @contextmanager
-def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+def launched(small: Path, name: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """A real-time rack without an end, after its first cycles."""
-    command = [*RACK, "run", str(small), "--set", "clock.mode=realtime"]
-    process = Popen(
-        [*command, "--set", f"name={name}", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
+    settings = ("--set=clock.mode=realtime", f"--set=name={name}")
+    with started("run", small, *settings, *arguments) as process:
         wait_until(lambda: is_ticking(name) or process.poll() is not None, BOUND_S)
         yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @pytest.fixture
 def running(small: Path, rack_name: str) -> Iterator[subprocess.Popen[str]]:
     with launched(small, rack_name, "--no-record") as process:
         yield process
-
-
-def wait_until_gone(name: str) -> bool:
-    deadline = time.monotonic() + BOUND_S
-    while name in list_racks() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return name not in list_racks()
 
 
 WAITS = ("waiting: ", "still importing ")
@@ -62,7 +44,7 @@ HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
 def imported(*arguments: object) -> set[str]:
     """Run a command as a separate process, and return the heavy libraries that it imported."""
     command = [sys.executable, "-X", "importtime", *RACK[1:], *map(str, arguments)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
+    done = run_to_end(command, BOUND_S, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout
     names = {
@@ -110,8 +92,7 @@ def test_run_prints_one_json_document_and_nothing_else(
     ]
     assert report["bytes_per_s"] == pytest.approx(report["bytes"] / 0.2)
     assert report["bytes"] > 0
-    again = rack("report", tmp_path / "run", "--json")
-    assert json.loads(again.stdout) == report
+    assert read_answer("report", tmp_path / "run") == report
     # The same document without a recording: what only a recording knows is null.
     bare = rack(*words, "--no-record")
     unrecorded = json.loads(bare.stdout)
@@ -160,17 +141,11 @@ def test_a_module_that_ends_its_process_is_a_mistake_of_the_config(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_name: str) -> None:
     config = upper_of(small, "while True: pass")
-    process = Popen(
-        [*RACK, "run", "--no-record", str(config), "--set", f"name={rack_name}"],
-        cwd=small.parent,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stderr is not None
-    try:
+    words = ("run", "--no-record", config, "--set", f"name={rack_name}")
+    with started(*words, cwd=small.parent) as process:
+        assert process.stderr is not None
         # On a slow machine other modules before it, and the crate.
         said = next(line for line in process.stderr if "own_upper" in line)
         assert said == "still importing 'own_upper'; it may take 60 s\n"
@@ -179,9 +154,6 @@ def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_na
         assert len(family) == 2
         process.send_signal(signal.SIGINT)
         assert process.wait(BOUND_S) == 128 + signal.SIGINT
-    finally:
-        process.kill()
-        process.communicate()
     wait_until(lambda: not any(map(runs, family)))
 
 
@@ -189,24 +161,24 @@ def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_na
 def test_a_running_rack_can_be_seen_and_stopped(
     running: subprocess.Popen[str], rack_name: str
 ) -> None:
-    listed = {entry["rack"]: entry["state"] for entry in json.loads(rack("list", "--json").stdout)}
+    listed = {entry["rack"]: entry["state"] for entry in read_answer("list")}
     assert listed[rack_name] == "running"
-    seen = json.loads(rack("status", rack_name, "--json").stdout)
+    seen = read_answer("status", rack_name)
     assert {task["task"] for task in seen["tasks"]} == {"upper", "lower", "lower.planner"}
     assert seen["tick"] > 0
     assert rack_name in rack("status", rack_name).stdout
     assert rack("stop", rack_name).returncode == 0
     running.communicate(timeout=BOUND_S)
-    assert wait_until_gone(rack_name)
+    wait_until(lambda: rack_name not in list_racks(), BOUND_S)
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path) -> None:
-    with launched(small, rack_name, "--out", str(tmp_path / "run")) as running:
+    with launched(small, rack_name, "--out", tmp_path / "run") as running:
         running.send_signal(signal.SIGINT)
         printed, said = running.communicate(timeout=BOUND_S)
     assert running.returncode == 128 + signal.SIGINT
-    assert wait_until_gone(rack_name)
+    wait_until(lambda: rack_name not in list_racks(), BOUND_S)
     folder = tmp_path / "run"
     if "no time for the report" in said:
         # On a busy machine the time for an end in order does not suffice: the run is whole.
@@ -226,12 +198,11 @@ def test_leftovers_of_a_killed_launcher_are_cleaned(
     seen = rack("status", rack_name)
     assert seen.stdout.startswith(f"rack {rack_name}: dead, ")
     assert "; its launcher is gone: 'rack clean' removes it" in seen.stdout.splitlines()[0]
-    cleaned = json.loads(rack("clean", "--json").stdout)
+    cleaned = read_answer("clean")
     assert rack_name not in cleaned["in_use"]
     assert rack_name not in list_racks()
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:
-    done = rack("run", small, "--seconds", 1, "--out", tmp_path)
-    assert done.returncode == 2
-    assert "not an empty folder" in done.stderr
+    refusal = read_refusal(rack("run", small, "--seconds", 1, "--out", tmp_path))
+    assert "not an empty folder" in refusal

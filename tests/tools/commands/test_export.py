@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -10,9 +9,8 @@ import pytest
 from mcap.reader import make_reader
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
-from rack.boards.config import load
-from tests.tools.command_line import rack, read_refusal
-from tests.tools.recordings import recorded
+from tests.tools.command_line import rack, read_answer, read_refusal
+from tests.tools.conftest import Record
 
 pytestmark = pytest.mark.slow
 
@@ -22,9 +20,7 @@ FILES = {"mcap": "run.mcap", "rosbag2": "run-rosbag2", "perfetto": "run.pftrace"
 
 def export(run: Path, kind: str) -> int:
     """Export a run under the default name, and return the number of entries."""
-    done = rack("export", run, "--to", kind, "--json")
-    assert (done.returncode, done.stderr) == (0, "")
-    answer = json.loads(done.stdout)
+    answer = read_answer("export", run, "--to", kind)
     path = run / FILES[kind]
     files = [path] if path.is_file() else [*path.iterdir()]
     assert answer["file"] == str(path)
@@ -60,20 +56,20 @@ def test_an_existing_file_is_kept(run: Path, kind: str, tmp_path: Path) -> None:
     assert path.read_text() == "kept"
 
 
-def test_a_refused_export_is_reported_in_one_line(run: Path, small: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_a_refused_export_is_reported_in_one_line(
+    run: Path, record: Record, tmp_path: Path
+) -> None:
+    empty, out = record({}).folder, tmp_path / "out"
     out.mkdir()
-    empty = recorded(tmp_path / "empty", load(small, []), {}).folder
+    new = ("--out", out / "x")
     nothing = f"{empty}: no message is recorded, so a bag would be empty"
+    no_cycle = f"{empty}: no cycle is recorded, so the trace would be empty"
     for words, why in (
         ((out,), f"{out}: not a run: it has no config.toml"),
         ((run, "--out", "/dev/full/x"), '"/dev/full/x.part": Not a directory'),
-        ((empty, "--out", out / "x"), nothing),
-        ((empty, "--to", "rosbag2", "--out", out / "x"), nothing),
-        (
-            (empty, "--to", "perfetto", "--out", out / "x"),
-            f"{empty}: no cycle is recorded, so the trace would be empty",
-        ),
+        ((empty, *new), nothing),
+        ((empty, "--to", "rosbag2", *new), nothing),
+        ((empty, "--to", "perfetto", *new), no_cycle),
     ):
         assert read_refusal(rack("export", *words)) == why
     assert [*out.iterdir()] == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -12,7 +11,7 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.console.answer import PIPE_WIDTH
-from tests.tools.command_line import rack, read_refusal
+from tests.tools.command_line import rack, read_answer, read_refusal
 from tests.tools.recordings import cycle, recorded
 
 ENDLESS = (
@@ -65,7 +64,6 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_the_rows_of_a_large_rack_are_not_wrapped_and_its_times_are_written_in_full(
     tmp_path: Path,
 ) -> None:
@@ -103,7 +101,7 @@ def test_without_budgets_a_run_is_shown_alone_and_a_config_has_no_schedule(tmp_p
     bare = config.model_copy(update={"board": {"level": level}})
     rows = [cycle(4 * n, 2000, *[8000 * n] * 4, 8000 * n + 1000) for n in range(9)]
     recorded(tmp_path / "run", bare, {"level": rows})
-    found = json.loads(rack("gantt", tmp_path / "run", "--json").stdout)
+    found = read_answer("gantt", tmp_path / "run")
     assert [panel["kind"] for panel in found["panels"]] == ["measured"]
     assert "no board has a budget" in found["notes"][0]
     (tmp_path / "bare.toml").write_text(bare.to_toml_text())

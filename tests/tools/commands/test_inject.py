@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -17,8 +16,9 @@ from rack.boards.errors import ConfigError
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.live import LiveRack
 from tests.boards.fault_racks import DRIVEN
-from tests.processes import RACK, start_rack, wait_until
-from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal
+from tests.processes import wait_until
+from tests.tools.command_line import rack, read_answer, read_refusal
+from tests.tools.held_racks import running_rack
 
 TASKS = "wave, wave.planner, watch, driven, clock"
 
@@ -26,19 +26,13 @@ TASKS = "wave, wave.planner, watch, driven, clock"
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Name of a real-time rack that runs until it is stopped."""
-    path, name = tmp_path_factory.mktemp("rack") / "waves.toml", f"test-inject-{os.getpid()}"
+    path = tmp_path_factory.mktemp("rack") / "waves.toml"
     path.write_text(DRIVEN)
-    command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
     # A machine that is busy must not use the restarts up.
-    settings = ["--set", f"name={name}", "--set", "supervision.restarts=1000"]
-    process = start_rack([*command, *settings], name, path.with_suffix(".log"))
-    try:
+    words = ("--set=clock.mode=realtime", "--set=supervision.restarts=1000")
+    with running_rack(path, f"test-inject-{os.getpid()}", *words) as name:
         yield name
         assert rack("stop", name).returncode == 0
-        process.wait(BOUND_S)
-    finally:
-        process.kill()
-        process.wait()
 
 
 @pytest.mark.slow
@@ -67,7 +61,7 @@ def test_waiting_is_for_the_end_of_a_fault(running: str) -> None:
 def test_a_fault_can_wait_for_a_tick_and_for_a_condition(running: str) -> None:
     tick = Segment.attach(running).words[System.TICK] + 2000
     drop = ("inject", running, "wave", "drop", "--for", "5ms")
-    answer = json.loads(rack(*drop, "--tick", tick, "--json").stdout)
+    answer = read_answer(*drop, "--tick", tick)
     # Later only by the ticks that a busy clock leaves out.
     assert answer["begins"] >= tick
     assert rack(*drop, "--when", "watch.status.state == executing").returncode == 0
@@ -91,7 +85,7 @@ def test_a_fault_with_a_condition_is_armed_and_can_be_withdrawn(running: str) ->
 @pytest.mark.slow
 def test_the_faults_of_a_rack_are_listed(running: str) -> None:
     rack("inject", running, "wave", "babble", "--for", "20ms", "writes=5")
-    listed = json.loads(rack("inject", running, "--list", "--json").stdout)
+    listed = read_answer("inject", running, "--list")
     assert listed[-1]["text"] == "babble of wave (writes 5)"
     assert listed[-1]["stage"] in ("active", "over")
     words = rack("inject", running, "--list").stdout.split()
@@ -137,13 +131,12 @@ IMPOSSIBLE: list[tuple[str, dict[str, str], str]] = [
 def test_a_fault_that_does_not_fit_the_rack_is_not_added(
     running: str, kind: str, keys: dict[str, str], line: str
 ) -> None:
-    injected = Segment.attach(running).words[System.INJECTED]
+    segment = Segment.attach(running)
+    injected = segment.words[System.INJECTED]
     with pytest.raises(ConfigError) as error:
-        LiveRack(Segment.attach(running)).inject_fault(
-            {"board": "wave", "kind": kind, **keys}, wait=False
-        )
+        LiveRack(segment).inject_fault({"board": "wave", "kind": kind, **keys}, wait=False)
     assert str(error.value).startswith(line)
-    assert Segment.attach(running).words[System.INJECTED] == injected
+    assert segment.words[System.INJECTED] == injected
 
 
 @pytest.mark.slow
@@ -161,7 +154,7 @@ def test_the_emergency_stop_is_latched_until_it_is_reset(running: str) -> None:
     assert (refused.returncode, refused.stderr) == (1, "the emergency stop stays latched: ACFAIL\n")
     assert words[System.EMERGENCY_STOP] == 1
     words[System.ACFAIL] = 0
-    reset = json.loads(rack("estop", running, "--reset", "--json").stdout)
+    reset = read_answer("estop", running, "--reset")
     assert (reset["emergency_stop"], words[System.EMERGENCY_STOP]) == (False, 0)
     assert words[System.DEMAND] == Demand.NONE
 
@@ -176,5 +169,5 @@ def test_the_list_has_every_kind_with_its_means_bound_and_parameters() -> None:
         row = words[at : at + 40]
         assert set(f"{kind.means} {kind.bound}".split()) <= set(row), kind.name
         assert all((kind.name, parameter.name) in lines for parameter in kind.parameters)
-    listed = json.loads(rack("inject", "--list", "--json").stdout)
+    listed = read_answer("inject", "--list")
     assert [kind["name"] for kind in listed] == [kind.name for kind in KINDS]

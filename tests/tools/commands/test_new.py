@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Sequence
 from itertools import count
@@ -14,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from rack.tools.commands.new import TEMPLATES
-from tests.tools.command_line import rack, read_refusal
+from tests.processes import run_to_end
+from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal
 
-BOUND_S = 100
 KINDS = ("level", "servo", "planner")
 NO_NAMES = ("", "3d", "class", "a-b", "../up", "Upper", "a" * 41)
 
@@ -36,9 +35,8 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
     kind: str, name: str, tmp_path: Path
 ) -> None:
     assert rack("new", kind, f"my_{kind}", folder=tmp_path).returncode == 0
-    done = rack("new", kind, name, "--json", folder=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    files = [tmp_path / file for file in json.loads(done.stdout)["files"]]
+    made = read_answer("new", kind, name, folder=tmp_path)
+    files = [tmp_path / file for file in made["files"]]
     assert sorted(files) == sorted((tmp_path / name).iterdir())
     assert {file.name for file in files} == {f"{name}.py", f"{name}.toml", f"test_{name}.py"}
     assert not [file for file in files if re.search(f"my_{kind}|My[A-Z]", file.read_text())]
@@ -53,13 +51,12 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 def test_the_written_files_run(kind: str, name: str, tmp_path: Path) -> None:
     """The next test but one runs a level."""
     assert rack("new", kind, name, folder=tmp_path).returncode == 0
-    run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "0.2", "--no-record")]
-    done = rack(*run, folder=tmp_path)
+    words = ("--lockstep", "--seconds", "0.2", "--no-record")
+    done = rack("run", f"{name}/{name}.toml", *words, folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     # A planner comes with an executor.
@@ -71,13 +68,10 @@ def test_the_written_files_pass_their_tests(
 ) -> None:
     names = [f"{name}_{kind}" for kind in kinds]
     for kind, each in zip(kinds, names, strict=True):
-        done = rack("new", kind, each, folder=tmp_path)
         hint = f"  rack run {each}/{each}.toml --lockstep --seconds 2\n  pytest {each}\n"
-        assert hint in done.stdout
+        assert hint in rack("new", kind, each, folder=tmp_path).stdout
     test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *names]
-    tested = subprocess.run(
-        test, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
+    tested = run_to_end(test, BOUND_S, cwd=tmp_path)
     assert f"{len(kinds)} passed" in tested.stdout, tested.stdout + tested.stderr
 
 
@@ -129,10 +123,7 @@ def test_an_existing_folder_is_not_changed(tmp_path: Path) -> None:
     assert (tmp_path / "mine" / "mine.py").read_text() == "mine"
 
 
-def test_each_template_is_three_files() -> None:
-    for kind in KINDS:
-        assert sorted(path.name for path in (TEMPLATES / kind).iterdir() if path.is_file()) == [
-            f"my_{kind}.py",
-            f"my_{kind}.toml",
-            f"test_my_{kind}.py",
-        ]
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_template_is_three_files(kind: str) -> None:
+    expected = {f"my_{kind}.py", f"my_{kind}.toml", f"test_my_{kind}.py"}
+    assert {path.name for path in (TEMPLATES / kind).iterdir() if path.is_file()} == expected

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import xml.etree.ElementTree as ElementTree
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.events import Event
-from rack.tools.recording.checksums import format_checked_line
 from tests.processes import wait_until
 from tests.shared_runs import slow_run, small_run
-from tests.tools.command_line import rack, read_refusal
+from tests.tools.command_line import rack, read_answer, read_refusal
 from tests.tools.held_racks import held_rack
-from tests.tools.recordings import cycle, recorded
+from tests.tools.recordings import add_events, cycle, recorded
 
 COUNT, STATE = "lower.status.count", "lower.status.state"
 
@@ -28,16 +25,14 @@ COUNT, STATE = "lower.status.count", "lower.status.state"
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small run, with a fault, a detection, a lost board and its restart."""
     folder = small_run(tmp_path_factory)
-    with (folder / "events.jsonl").open("a") as events:
-        for tick, kind, code in (
-            (400, "fault", "begins"),
-            (404, "detection", "hang"),
-            (404, "died", "died"),
-            (500, "recovery", "rejoined"),
-            (600, "fault", "ends"),
-        ):
-            event = Event(0, tick, kind, "lower", f"{code} it", code)  # type: ignore[arg-type]
-            events.write(format_checked_line(asdict(event)))
+    add_events(
+        folder,
+        (400, "fault", "begins", "begins it"),
+        (404, "detection", "hang", "hang it"),
+        (404, "died", "died", "died it"),
+        (500, "recovery", "rejoined", "rejoined it"),
+        (600, "fault", "ends", "ends it"),
+    )
     return folder
 
 
@@ -58,8 +53,7 @@ def test_curves_and_marks_are_printed_in_80_columns_without_colours(run: Path) -
 
 
 def test_the_values_of_a_window_are_those_of_the_recording(run: Path) -> None:
-    shown = rack("plot", run, COUNT, STATE, "--from", 1, "--to", 1.005, "--json")
-    found = json.loads(shown.stdout)
+    found = read_answer("plot", run, COUNT, STATE, "--from", 1, "--to", 1.005)
     count, state = found["curves"]
     assert count["time_s"] == pytest.approx([1.0, 1.0025, 1.005])
     assert count["values"] == sorted(count["values"])
@@ -69,10 +63,10 @@ def test_the_values_of_a_window_are_those_of_the_recording(run: Path) -> None:
 
 
 def test_a_condition_chooses_the_window(run: Path) -> None:
-    (whole,) = json.loads(rack("plot", run, COUNT, "--json").stdout)["curves"]
+    (whole,) = read_answer("plot", run, COUNT)["curves"]
     middle = whole["values"][len(whole["values"]) // 2]
     condition = f"{COUNT} >= {middle}"
-    found = json.loads(rack("plot", run, COUNT, "--when", condition, "--json").stdout)
+    found = read_answer("plot", run, COUNT, "--when", condition)
     (trigger,) = [mark for mark in found["marks"] if mark["kind"] == "trigger"]
     first = next(at for at, value in enumerate(whole["values"]) if value >= middle)
     at_s = whole["time_s"][first]
@@ -85,7 +79,7 @@ def test_the_curves_of_two_runs_are_plotted_in_one_panel(
     run: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     slow = slow_run(tmp_path_factory)
-    found = json.loads(rack("plot", run, COUNT, "--against", slow, "--json").stdout)
+    found = read_answer("plot", run, COUNT, "--against", slow)
     here, there = found["curves"]
     # The folders have the same name.
     assert (here["run"], there["run"]) == (str(run), str(slow))

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from ctypes import CDLL
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load
+from rack.boards.config import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
@@ -30,61 +30,56 @@ from rack.tools.report.report import write_report
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts
+from tests.boards.runs import end_of, watch_until
 from tests.processes import RACK, wait_until
+from tests.tools.command_line import read_failure, started
 from tests.tools.machines import A, B, recorded
-from tests.tools.recording.struck_recorders import has_spooled
-from tests.warm import Popen, run_command
+from tests.tools.recording.struck_recorders import has_spooled, realtime
+from tests.warm import run_command
 
 pytestmark = pytest.mark.thorough
 
-ROOT = Path(__file__).resolve().parents[2]
+
 WATCHDOG_S = 100.0
 
 
-@pytest.mark.slow
-def test_a_rack_that_runs_can_be_recorded_until_its_end(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
-    with Rack(config) as rack:
+def recorder_of(name: str, folder: Path) -> AbstractContextManager[subprocess.Popen[str]]:
+    """Record a rack that runs, by a command in a process of its own."""
+    return started("record", name, "--out", folder, "--json")
+
+
+def test_a_rack_that_runs_can_be_recorded_until_its_end(config: RackConfig, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Rack(realtime(config)) as rack:
         rack.start()
-        command = [*RACK, "record", rack_name, "--out", str(tmp_path / "run"), "--json"]
-        with Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as recorder:
-            deadline = time.monotonic() + WATCHDOG_S
-            while not (tmp_path / "run" / "run.rrd").is_file() and time.monotonic() < deadline:
-                rack.watch(0.1)
+        with recorder_of(config.name, folder) as recorder:
+            watch_until(rack, (folder / "run.rrd").is_file)
             rack.stop("recorded")
-            while rack.watch(0.5):
-                continue
+            ticks_run = end_of(rack).ticks
             answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
     assert recorder.returncode == 0
-    folder = tmp_path / "run"
     files = [path for path in folder.rglob("*") if path.is_file() and path.name != CHECKSUMS]
     assert answer.pop("bytes_per_s") > 0
     written = sum(path.stat().st_size for path in files)
-    assert answer == {"rack": rack_name, "folder": str(folder), "notes": [], "bytes": written}
-    assert rack.outcome is not None
-    report, _ = write_report(tmp_path / "run")
-    assert report["rack"] == rack_name
+    assert answer == {"rack": config.name, "folder": str(folder), "notes": [], "bytes": written}
+    report, _ = write_report(folder)
+    assert report["rack"] == config.name
     assert report["tasks"]["lower"]["traced"] > 0
-    ticks = Recording(tmp_path / "run").read_signal("lower.status", "tick")
-    assert ticks[-1] == rack.outcome.ticks - 1
+    ticks = Recording(folder).read_signal("lower.status", "tick")
+    assert ticks[-1] == ticks_run - 1
     shown = read_component(folder / "run.rrd", "/signals/lower.status/count")
     assert shown.ticks.tolist() == ticks.tolist()
 
 
-@pytest.mark.slow
 def test_the_recording_so_far_is_saved_while_the_run_continues(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     run, saved = tmp_path / "run", tmp_path / "saved"
-    settings = ["--set", f"name={rack_name}", "--set", "clock.mode=realtime", "--out", str(run)]
     # The rings hold two seconds of simulated time: at this speed a recorder that is late loses
     # nothing.
-    settings += ["--set", "clock.speed=0.2"]
-    with Popen(
-        [*RACK, "run", str(small), "--json", *settings], stdout=subprocess.DEVNULL
-    ) as process:
+    settings = (f"name={rack_name}", "clock.mode=realtime", "clock.speed=0.2")
+    words = (*(f"--set={setting}" for setting in settings), "--out", run, "--json")
+    with started("run", small, *words, stdout=subprocess.DEVNULL, stderr=None) as process:
         try:
             # Some rows of every ring are on the disk.
             wait_until(lambda: has_spooled(run, 10), WATCHDOG_S)
@@ -95,6 +90,7 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
         finally:
             # Not by a signal, which ends it in a hurry.
             run_command([*RACK, "stop", rack_name], WATCHDOG_S)
+            process.wait(WATCHDOG_S)
     # On a slow machine it says how far it is.
     said = [line for line in done.stderr.splitlines() if not line.startswith("merging the rec")]
     assert (done.returncode, said) == (0, [])
@@ -127,7 +123,6 @@ def test_an_unrecorded_rack_cannot_be_saved(config: RackConfig, tmp_path: Path) 
             record(config.name, out=None, view=True, save=True)
 
 
-@pytest.mark.slow
 def test_racks_that_work_together_are_replayed_on_one_time_line(
     rack_name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -138,11 +133,7 @@ def test_racks_that_work_together_are_replayed_on_one_time_line(
         near.start()
         folder = tmp_path / "run"
         with ExitStack() as stack:
-            recorders = []
-            for name in names:
-                command = [*RACK, "record", name, "--out", str(folder / name), "--json"]
-                pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": ROOT}
-                recorders.append(stack.enter_context(Popen(command, **pipes)))
+            recorders = [stack.enter_context(recorder_of(name, folder / name)) for name in names]
             deadline = time.monotonic() + WATCHDOG_S
             while (
                 not all((folder / name / "run.rrd").is_file() for name in names)
@@ -156,7 +147,7 @@ def test_racks_that_work_together_are_replayed_on_one_time_line(
                 continue
             for recorder in recorders:
                 _, err = recorder.communicate(timeout=WATCHDOG_S)
-                assert recorder.returncode == 0, err.decode()
+                assert recorder.returncode == 0, err
     replay([folder / name for name in names[::-1]], folder / "run.rrd", against=None)
     note = capsys.readouterr().err.splitlines()[-1]
     assert note.startswith(f"rack '{names[0]}' is on the time line of '{names[1]}'")
@@ -185,32 +176,23 @@ def kill_thread(pid: int, number: int) -> None:
     assert CDLL(None).tgkill(pid, max(others), number) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "send"),
     [(signal.SIGINT, os.kill), (signal.SIGTERM, os.kill), (signal.SIGHUP, kill_thread)],
     ids=["SIGINT", "SIGTERM", "a thread"],
 )
 def test_a_signal_ends_a_recording_at_once(
-    small: Path,
-    rack_name: str,
-    tmp_path: Path,
-    number: signal.Signals,
-    send: Callable[[int, int], None],
+    config: RackConfig, tmp_path: Path, number: signal.Signals, send: Callable[[int, int], None]
 ) -> None:
     folder = tmp_path / "run"
-    with ExitStack() as stack:
-        config = load(small, [f"name={rack_name}", "clock.mode=realtime"])
-        stack.enter_context(Rack(config)).start()
-        command = [*RACK, "record", rack_name, "--out", str(folder), "--json"]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        recorder = stack.enter_context(Popen(command, cwd=ROOT, **pipes))
-        stack.callback(recorder.kill)
-        wait_until((folder / "run.rrd").is_file, WATCHDOG_S)
-        sent_s = time.monotonic()
-        send(recorder.pid, number)
-        out, said = recorder.communicate(timeout=WATCHDOG_S)
-        took_s = time.monotonic() - sent_s
+    with Rack(realtime(config)) as rack:
+        rack.start()
+        with recorder_of(config.name, folder) as recorder:
+            wait_until((folder / "run.rrd").is_file, WATCHDOG_S)
+            sent_s = time.monotonic()
+            send(recorder.pid, number)
+            out, said = recorder.communicate(timeout=WATCHDOG_S)
+            took_s = time.monotonic() - sent_s
     assert recorder.returncode == 128 + number, said
     is_finished = not (folder / "recorder.spool").exists()
     assert write_report(folder)[0]["tasks"]["lower"]["traced"] > 0
@@ -235,9 +217,7 @@ def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None
         ([runs[0], tmp_path / "c"], tmp_path / "new.rrd", "c: no such folder"),
         ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),
     ):
-        with pytest.raises(Failure, match=why) as refused:
-            replay(given, file, against=None)
-        assert refused.value.status == 2
+        assert why in read_failure(replay, given, file, None)
     assert out.read_bytes() == made
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
@@ -13,14 +13,12 @@ from typing import Any
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import load
-from rack.boards.events import CONTINUATION_CODE, Event
+from rack.boards.events import CONTINUATION_CODE
 from rack.tools.launch.continued import RepeatedRun
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from tests.boards.remembering_racks import REMEMBERING
 from tests.processes import descriptors
+from tests.shared_runs import run_text
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
@@ -31,13 +29,7 @@ DIGITS = "9" * 400
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 500 ticks."""
-    folder = tmp_path_factory.mktemp("rewound")
-    path = folder / "remembering.toml"
-    path.write_text(REMEMBERING)
-    run = folder / "run"
-    config = load(path, [f"name=test-rewind-{folder.name}"])
-    run_rack(config, SECONDS, run, Display())
-    return run
+    return run_text(tmp_path_factory, REMEMBERING, SECONDS)
 
 
 class Asked:
@@ -101,9 +93,8 @@ def test_a_condition_is_found_forwards_and_backwards(run: Path, asked: Asked) ->
 
 def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
     found = asked("goto 1.2", "show wave", "goto 1", "show wave", "goto 0.3", "show wave")
-    assert found[1]["value"]["_recent"] == [tick % 7 for tick in range(475, 480)]
-    assert found[3]["value"]["_recent"] == [tick % 7 for tick in range(395, 400)]
-    assert found[5]["value"]["_recent"] == [tick % 7 for tick in range(115, 120)]
+    for one, tick in zip(found[1::2], (480, 400, 120), strict=True):
+        assert one["value"]["_recent"] == [before % 7 for before in range(tick - 5, tick)]
 
 
 def test_later_ticks_continue_from_the_nearest_reached_tick(
@@ -115,7 +106,9 @@ def test_later_ticks_continue_from_the_nearest_reached_tick(
     @contextmanager
     def noted(self: RepeatedRun, *asked: Any) -> Iterator[Rack]:
         with rack_at(self, *asked) as ran:
-            begun.append(continued_from(ran.events))
+            # The tick of the snapshot from which it continued, or -1 without one.
+            snapshots = (one.tick for one in ran.events if one.code == CONTINUATION_CODE)
+            begun.append(next(snapshots, -1))
             yield ran
 
     monkeypatch.setattr(RepeatedRun, "run_rack_to", noted)
@@ -131,11 +124,6 @@ def test_later_ticks_continue_from_the_nearest_reached_tick(
     assert descriptors() == before
     with RepeatedRun(Recording(run)) as alone:
         assert alone.read_levels(470) == levels[1]
-
-
-def continued_from(events: Sequence[Event]) -> int:
-    """Return the tick of the snapshot from which a rack continued, or -1 without one."""
-    return next((event.tick for event in events if event.code == CONTINUATION_CODE), -1)
 
 
 def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
@@ -161,14 +149,12 @@ def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
 
 @pytest.mark.thorough
 def test_a_branch_may_begin_while_a_cycle_is_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, run = tmp_path / "late.toml", tmp_path / "run"
-    fault = '[[fault]]\nkind = "overrun"\nboard = "watch"\ntick = 100\nfor = 0.25\nby = 2.0\n'
-    path.write_text(REMEMBERING + fault)
-    run_rack(load(path, [f"name=test-late-{tmp_path.name[-20:]}"]), 0.5, run, Display())
+    fault = 'fault=[{ kind = "overrun", board = "watch", tick = 100, for = 0.25, by = 2.0 }]'
+    run = run_text(tmp_path_factory, REMEMBERING, 0.5, fault)
     # The cycle that was released at tick 104 ends after tick 110.
-    branch = tmp_path / "branch"
+    branch = run.with_name("branch")
     found = Asked(run, monkeypatch)("goto 0.275", f"branch --out {branch}")[-1]
     expected = Recording(run).end_counts["outcome"]["digest"]
     assert found["outcome"]["digest"] == expected

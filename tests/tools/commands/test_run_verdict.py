@@ -9,7 +9,7 @@ import pytest
 
 from rack.tools.launch.verdict import UNRECORDED
 from rack.tools.report.summary import format_run_summary
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_answer
 
 CRASHES = (
     "board.lower.executor=two_levels:Crashing",
@@ -21,7 +21,6 @@ LATE = "level 'lower' missed 0 and skipped 120 of its 120 cycles (100 %; at most
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_failed_run_has_the_same_verdict_everywhere(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
@@ -42,7 +41,7 @@ def test_a_failed_run_has_the_same_verdict_everywhere(
     found = [miss for miss in report["misses"] if miss["task"] == "lower"]
     assert sum(miss["count"] for miss in found) == report["tasks"]["lower"]["skipped"] == 120
     (folder / "report.json").unlink()
-    again = json.loads(rack("report", folder, "--json").stdout)
+    again = read_answer("report", folder)
     assert (again["worked"], again["failures"]) == (False, [LATE])
 
     bare = rack(*words, "--no-record", "--json")

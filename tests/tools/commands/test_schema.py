@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from tests.tools.command_line import rack, read_refusal
+from tests.tools.command_line import rack, read_answer, read_refusal
 
 
 def test_without_a_table_it_lists_the_tables(small: Path) -> None:
@@ -23,7 +22,7 @@ def test_each_key_of_a_table_has_unit_range_default_and_meaning(small: Path) -> 
     assert " ".join(line.split()).startswith(
         "period_ms ms number 0.01 to 1000 required tick period; "
     )
-    (table,) = json.loads(rack("schema", "clock", "--json", "--config", small).stdout)
+    (table,) = read_answer("schema", "clock", "--config", small)
     assert table["heading"] == "[clock]"
     assert {"name", *head.split()[1:]} == set(table["keys"][0])
 

@@ -14,11 +14,10 @@ import pytest
 
 from rack.backplane.segment import SHM_FOLDER
 from tests.processes import BOUND_S, RACK, children_of, named, wait_until
+from tests.tools.command_line import ROOT
 from tests.warm import Popen
 
 pytestmark = pytest.mark.thorough
-
-ROOT = Path(__file__).resolve().parents[3]
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 BEGUN = ("cycle", "close", "report")
 """Moments at which a run has begun: there is a report of it."""
@@ -69,7 +68,6 @@ class Run:
         return is_there or "no time for the report: 'rack report" in said
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moment", "number"),
     # Each moment once, and each signal during the launch. During the run: SIGHUP below, SIGINT in
@@ -87,7 +85,6 @@ def test_a_signal_at_any_moment_ends_a_run_and_leaves_nothing(
     assert run.reported(said) == (moment in BEGUN)
 
 
-@pytest.mark.slow
 def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
@@ -99,7 +96,6 @@ def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
     assert run.reported(said)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.02, 0.25, 0.6])
 def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     small: Path, rack_name: str, tmp_path: Path, delay_s: float
@@ -113,7 +109,6 @@ def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     assert status == 128 + number or (delay_s < 0.1 and status), said
 
 
-@pytest.mark.slow
 def test_closing_the_terminal_ends_a_run_in_order(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
@@ -134,7 +129,6 @@ def test_closing_the_terminal_ends_a_run_in_order(
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]
 
 
-@pytest.mark.slow
 def test_under_nohup_a_run_outlives_its_terminal_and_ends_by_other_signals(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:

@@ -17,7 +17,6 @@ from rack.boards.config import RackConfig, load, resolve_layout
 from rack.tools.ecosystem.perfetto_trace import export_trace
 from rack.tools.recording.recording import Recording
 from tests.pages import ROOT
-from tests.shared_runs import nasrem_run
 from tests.tools.ecosystem.trace_processor import open_trace
 from tests.tools.recordings import MS, Cycle, Row, recorded
 
@@ -186,10 +185,8 @@ def test_the_query_of_the_page_finds_the_cycle_3_s_before_a_miss(recording: Reco
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
-def test_perfetto_reads_a_whole_run(tmp_path_factory: pytest.TempPathFactory) -> None:
-    recording = Recording(nasrem_run(tmp_path_factory))
-    with open_trace(export(recording)) as trace:
+def test_perfetto_reads_a_whole_run(nasrem: Recording) -> None:
+    with open_trace(export(nasrem)) as trace:
         rows = trace.query(
             "select track.name as task, count(*) as cycles, sum(dur) as used from slice join track"
             " on track.id = track_id where slice.name = 'cycle' group by 1"
@@ -197,7 +194,7 @@ def test_perfetto_reads_a_whole_run(tmp_path_factory: pytest.TempPathFactory) ->
         counted = {row["task"]: (row["cycles"], row["used"]) for row in rows}
         assert counted == {
             task: (len(cycles), int((cycles["end_ns"] - cycles["start_ns"]).sum()))
-            for task, cycles in recording.cycles.items()
+            for task, cycles in nasrem.cycles.items()
         }
         (arrows,) = trace.query(
             "select count(*) as n, min(reader.ts - message.ts) as least from flow"

@@ -21,7 +21,6 @@ from rack.levels.robot.engine import view_state
 from rack.tools.ecosystem.ros_messages import RosEncoder
 from rack.tools.ecosystem.rosbag2 import MailboxEncoder, export_bag
 from rack.tools.recording.recording import Recording
-from tests.shared_runs import nasrem_run
 
 SECOND_NS = 10**9
 Messages = dict[str, list[tuple[int, Any]]]
@@ -29,15 +28,10 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return Recording(nasrem_run(tmp_path_factory))
-
-
-@pytest.fixture(scope="module")
-def bag(recording: Recording) -> Path:
-    path = recording.folder / "bag"
+def bag(nasrem: Recording) -> Path:
+    path = nasrem.folder / "bag"
     shown: list[float] = []
-    assert export_bag(recording, path, shown.append) > 0
+    assert export_bag(nasrem, path, shown.append) > 0
     assert shown == sorted(shown)
     return path
 
@@ -59,10 +53,10 @@ def read_stamp(stamp: Any) -> int:
 
 @pytest.mark.slow
 def test_joint_states_have_the_numbers_of_the_servo_status(
-    recording: Recording, messages: Messages
+    nasrem: Recording, messages: Messages
 ) -> None:
     def read(*names: str) -> list[list[float]]:
-        columns = [recording.read_signal("servo.status", name) for name in names]
+        columns = [nasrem.read_signal("servo.status", name) for name in names]
         return np.column_stack(columns).tolist()  # type: ignore[no-any-return]
 
     states = [state for _, state in messages["/joint_states"]]
@@ -72,24 +66,24 @@ def test_joint_states_have_the_numbers_of_the_servo_status(
     assert [state.position for state in states] == read("position", "opening")
     assert [state.velocity for state in states] == read("velocity", "opening_velocity")
     assert [state.effort for state in states] == read("torque", "grip_force")
-    ticks = recording.read_signal("servo.status", "tick")
-    times = (ticks * recording.layout.clock_ns).tolist()
+    ticks = nasrem.read_signal("servo.status", "tick")
+    times = (ticks * nasrem.layout.clock_ns).tolist()
     assert [read_stamp(state.header.stamp) for state in states] == times
     assert [time for time, _ in messages["/joint_states"]] == times
 
 
 @pytest.mark.slow
 def test_every_message_of_every_mailbox_is_in_the_bag_bit_for_bit(
-    recording: Recording, messages: Messages
+    nasrem: Recording, messages: Messages
 ) -> None:
     exported = {topic for topic in messages if topic.startswith("/mailbox/")}
-    assert exported == {f"/mailbox/{name.replace('.', '/')}" for name in recording.mailboxes}
-    for name in recording.mailboxes:
-        rows = recording.read_rows(name)
+    assert exported == {f"/mailbox/{name.replace('.', '/')}" for name in nasrem.mailboxes}
+    for name in nasrem.mailboxes:
+        rows = nasrem.read_rows(name)
         found = [message for _, message in messages[f"/mailbox/{name.replace('.', '/')}"]]
         for column in ("serial", "tick", "visible_at", "stamp_ns"):
             assert [getattr(m, f"message_{column}") for m in found] == rows[column].tolist()
-        compare(recording.layout.find_mailbox(name).fields, found, rows["message"])
+        compare(nasrem.layout.find_mailbox(name).fields, found, rows["message"])
 
 
 def compare(fields: tuple[FieldSpec, ...], found: list[Any], records: np.ndarray) -> None:
@@ -110,20 +104,20 @@ def compare(fields: tuple[FieldSpec, ...], found: list[Any], records: np.ndarray
 
 @pytest.mark.slow
 def test_poses_are_those_of_the_model_in_the_recorded_state(
-    recording: Recording, messages: Messages
+    nasrem: Recording, messages: Messages
 ) -> None:
     import mujoco
 
     from rack.boards.config.cell import build_rack_cell
 
-    cell = build_rack_cell(recording.rack_config)
+    cell = build_rack_cell(nasrem.rack_config)
     data = cell.build_start_data()
-    states = recording.read_signal("servo.state", "state")
-    ticks = recording.read_signal("servo.state", "tick").tolist()
+    states = nasrem.read_signal("servo.state", "state")
+    ticks = nasrem.read_signal("servo.state", "tick").tolist()
     moments = messages["/tf"]
     assert np.diff([time for time, _ in moments]).max() == SECOND_NS // 50
     for time, message in moments[::40]:
-        view_state(cell.model, data, states[ticks.index(time // recording.layout.clock_ns)])
+        view_state(cell.model, data, states[ticks.index(time // nasrem.layout.clock_ns)])
         mujoco.mj_kinematics(cell.model, data)
         for transform in message.transforms:
             body = data.body(transform.child_frame_id)
@@ -137,18 +131,18 @@ def test_poses_are_those_of_the_model_in_the_recorded_state(
 
 @pytest.mark.slow
 def test_statuses_and_diagnostics_have_the_values_of_the_run(
-    recording: Recording, messages: Messages
+    nasrem: Recording, messages: Messages
 ) -> None:
-    rack = recording.layout.rack
+    rack = nasrem.layout.rack
     levels = {"servo", "primitive", "elemental_move", "task"}
     assert {topic for topic in messages if topic.startswith("/rack/")} == {
         f"/rack/{level}/status" for level in levels
     }
-    ticks = recording.read_signal("servo.status", "tick").tolist()
-    openings = recording.read_signal("servo.status", "opening")
+    ticks = nasrem.read_signal("servo.status", "tick").tolist()
+    openings = nasrem.read_signal("servo.status", "opening")
     for time, status in messages["/rack/servo/status"][::20]:
         values = {pair.key: pair.value for pair in status.values}
-        row = ticks.index(time // recording.layout.clock_ns)
+        row = ticks.index(time // nasrem.layout.clock_ns)
         assert float(values["opening"]) == openings[row]
         assert (status.name, status.message) == (f"{rack}: servo", values["state"])
         assert (status.level, status.hardware_id) == (0, rack)
@@ -157,11 +151,11 @@ def test_statuses_and_diagnostics_have_the_values_of_the_run(
         for status in array.status:
             values = {pair.key: pair.value for pair in status.values}
             counts[status.name] = counts.get(status.name, 0) + int(values["cycles"])
-    assert counts == {f"{rack}: {task}": len(rows) for task, rows in recording.cycles.items()}
+    assert counts == {f"{rack}: {task}": len(rows) for task, rows in nasrem.cycles.items()}
     logged = [(entry.name, entry.msg) for _, entry in messages["/rosout"]]
     assert logged == [
         (event["board"] or rack, f"{event['kind']}: {event['text']}")
-        for event in recording.events
+        for event in nasrem.events
         if event.get("tick", -1) >= 0
     ]
 

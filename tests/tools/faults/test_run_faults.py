@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from rack.backplane.segment import list_racks
 from rack.boards.config import load_text
-from tests.tools.command_line import rack, read_refusal
+from tests.tools.command_line import rack, read_answer, read_refusal
 
 pytestmark = pytest.mark.slow
 
 HANG = '[[fault]]\nkind = "hang"\nboard = "upper"\nat = 0.5\n'
 
 
-def run(config: Path | str, name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return rack("run", config, "--set", f"name={name}", *arguments)
-
-
 @pytest.mark.thorough
 def test_a_run_with_a_script_repeats_with_its_faults(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
-    script = tmp_path / "hang.toml"
+    script, run = tmp_path / "hang.toml", tmp_path / "run"
     script.write_text(HANG)
-    words = ("--seconds", "2", "--json")
-    done = run(small, rack_name, "--faults", script, "--out", tmp_path / "run", *words)
-    assert done.returncode == 0, done.stderr
+    words = ("--set", f"name={rack_name}", "--seconds", "2")
+    report = read_answer("run", small, *words, "--faults", script, "--out", run)
     # The resolved config holds the script: it needs no file to run again.
-    again = run(tmp_path / "run" / "config.toml", rack_name, "--no-record", *words)
-    assert again.returncode == 0, again.stderr
-    report, repeated = json.loads(done.stdout), json.loads(again.stdout)
+    repeated = read_answer("run", run / "config.toml", *words, "--no-record")
     assert report["digest"] == repeated["digest"]
     assert [fault["struck"] for fault in report["faults"]] == [200]
-    found = load_text((tmp_path / "run" / "config.toml").read_text())
+    found = load_text((run / "config.toml").read_text())
     assert [(fault.kind, fault.at) for fault in found.fault] == [("hang", 0.5)]
 
 
@@ -62,7 +53,7 @@ def test_a_script_that_does_not_fit_is_refused_before_anything_starts(
     if "\n" in script or " " in script:
         given = str(tmp_path / "script.toml")
         Path(given).write_text(script)
-    done = run(small, rack_name, "--faults", given, "--out", tmp_path / "run")
-    assert read_refusal(done).startswith(line)
+    words = ("--set", f"name={rack_name}", "--faults", given, "--out", tmp_path / "run")
+    assert read_refusal(rack("run", small, *words)).startswith(line)
     assert not (tmp_path / "run").exists()
     assert rack_name not in list_racks()

@@ -26,7 +26,7 @@ from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.tools.command_line import rack
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 SECONDS = 0.8
 HOLD = "level = 'upper', what = 'hold', tick = 40"
@@ -66,40 +66,32 @@ class ByHand(Display):
     def __init__(self, rack: str, given: Sequence[tuple[Request, Client]]) -> None:
         self._rack = rack
         self._given = [*given]
-        self._segment: Segment | None = None
-        self._claims = ExitStack()
+        self._stack = ExitStack()
 
     def show(self, snapshot: Snapshot) -> None:
         """Command what is due, and step the rack to the next command."""
-        if self._segment is None:
-            self._segment = Segment.attach(self._rack)
-        words = self._segment.words
+        segment = self._stack.enter_context(closing(Segment.attach(self._rack)))
+        words = segment.words
         if not words[System.HELD]:
             return
         if self._given and words[System.HELD] - 1 == self._given[0][0].tick:
             request, client = self._given.pop(0)
-            claim = OperatorTable(self._segment).claim_request(replace(request, tick=-1), client)
-            self._claims.enter_context(claim)
+            claim = OperatorTable(segment).claim_request(replace(request, tick=-1), client)
+            self._stack.enter_context(claim)
         words[System.HOLD_AT] = self._given[0][0].tick + 1 if self._given else 0
 
     def close(self) -> None:
         """Leave the rack."""
-        self._claims.close()
-        if self._segment is not None:
-            self._segment.close()
+        self._stack.close()
 
 
 def requests(config: RackConfig, *commands: tuple[str, int]) -> tuple[Request, ...]:
     """Return commands to the upper level, each with its tick."""
     plan = resolve(config)
+    tables = ({"level": "upper", "what": what, "tick": tick} for what, tick in commands)
     return tuple(
-        build_request(
-            parse_command({"level": "upper", "what": what, "tick": tick}),
-            config,
-            plan.published.levels,
-            plan.layout,
-        )
-        for what, tick in commands
+        build_request(parse_command(table), config, plan.published.levels, plan.layout)
+        for table in tables
     )
 
 
@@ -123,11 +115,12 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
     return Recording(run)
 
 
-def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
-    """Return the run that continues another run without a note."""
+def continued(one: Recording, at: float, name: str, *settings: str) -> Recording:
+    """Return the run beside another one that continues it without a note."""
+    folder = one.folder.with_name(name)
     options = [option for setting in settings for option in ("--set", setting)]
-    names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
-    done = rack("run", *names, *options)
+    words = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
+    done = rack("run", *words, *options)
     assert not done.stderr
     assert json.loads(done.stdout)["recording"] == "complete"
     return Recording(folder)
@@ -143,9 +136,8 @@ def check_repetition(one: Recording, two: Recording, ticks: Sequence[int]) -> No
 @pytest.fixture(scope="module")
 def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A lockstep run whose operator gives commands that are not in the config."""
-    return commanded(
-        tmp_path_factory.mktemp("lockstep"), f"test-repeated-{os.getpid()}", "lockstep"
-    )
+    folder = tmp_path_factory.mktemp("lockstep")
+    return commanded(folder, f"test-repeated-{os.getpid()}", "lockstep")
 
 
 def test_an_operators_command_is_not_mistaken_for_one_of_the_config(in_lockstep: Recording) -> None:
@@ -154,23 +146,22 @@ def test_an_operators_command_is_not_mistaken_for_one_of_the_config(in_lockstep:
 
 @pytest.mark.parametrize(("at", "ticks"), [(0.0, [20, 30, 40, 80, 200]), (0.3025, [200])])
 def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
-    in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
+    in_lockstep: Recording, at: float, ticks: list[int]
 ) -> None:
-    two = continued(in_lockstep, at, tmp_path / "two")
+    two = continued(in_lockstep, at, f"from-{at}")
     check_repetition(in_lockstep, two, ticks)
     # Under a name of its own, the rack writes the name of the original one.
     name = in_lockstep.rack_config.name
     assert set(two.read_signal("upper.status", "reason").tolist()) == {f"rack command {name}"}
 
 
-def test_a_repeated_run_without_the_commands_differs(
-    in_lockstep: Recording, tmp_path: Path
-) -> None:
+def test_a_repeated_run_without_the_commands_differs(in_lockstep: Recording) -> None:
     # The run's config has no command but the first one.
     again = load(in_lockstep.folder / "config.toml", [])
     assert [command.tick for command in again.command] == [40]
-    run_rack(again, 0.1, tmp_path / "two", Display())
-    difference = find_first_difference(in_lockstep, Recording(tmp_path / "two"))
+    folder = in_lockstep.folder.with_name("without")
+    run_rack(again, 0.1, folder, Display())
+    difference = find_first_difference(in_lockstep, Recording(folder))
     assert difference is not None
     assert difference.tick == GIVEN[0][1]
 
@@ -180,7 +171,7 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
     rack_name: str, tmp_path: Path
 ) -> None:
     one = commanded(tmp_path, rack_name, "realtime")
-    two = continued(one, 0.0, tmp_path / "two")
+    two = continued(one, 0.0, "two")
     assert two.rack_config.clock.mode == "lockstep"
     missed = [miss["tick"] for miss in list_misses(one)]
     difference = find_first_difference(one, two)
@@ -208,26 +199,20 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return one
 
 
-def test_a_run_continues_after_the_last_command_of_its_operators(
-    by_hand: Recording, tmp_path: Path
-) -> None:
-    check_repetition(by_hand, continued(by_hand, 0.7, tmp_path / "two"), [])
+def test_a_run_continues_after_the_last_command_of_its_operators(by_hand: Recording) -> None:
+    check_repetition(by_hand, continued(by_hand, 0.7, "after"), [])
 
 
-def test_a_command_that_waits_in_a_snapshot_is_issued_once(
-    by_hand: Recording, tmp_path: Path
-) -> None:
-    two = continued(by_hand, 0.3, tmp_path / "two")
+def test_a_command_that_waits_in_a_snapshot_is_issued_once(by_hand: Recording) -> None:
+    two = continued(by_hand, 0.3, "two")
     check_repetition(by_hand, two, [140, 260])
     # Those that two repeats wait in the snapshot at tick 240.
-    check_repetition(two, continued(two, 0.6, tmp_path / "three"), [260])
+    check_repetition(two, continued(two, 0.6, "three"), [260])
 
 
-def test_a_branch_adds_its_commands_to_the_repeated_ones(
-    by_hand: Recording, tmp_path: Path
-) -> None:
+def test_a_branch_adds_its_commands_to_the_repeated_ones(by_hand: Recording) -> None:
     earlier = "level = 'upper', what = 'hold', tick = 200"
-    two = continued(by_hand, 0.25, tmp_path / "two", commands(HOLD, earlier))
+    two = continued(by_hand, 0.25, "branch", commands(HOLD, earlier))
     assert two.read_signal("upper.operator", "tick").tolist() == [140, 200, 260]
 
 

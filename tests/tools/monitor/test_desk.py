@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,23 +18,17 @@ from rack.backplane.words import System
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
-from tests.processes import RACK, start_rack, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack, read_answer, read_refusal
-from tests.warm import Popen
+from tests.processes import wait_until
+from tests.tools.command_line import BOUND_S, rack, read_answer, read_refusal, started
+from tests.tools.held_racks import running_rack
+
+pytestmark = pytest.mark.slow
 
 
-def start(path: Path, name: str, *settings: str) -> subprocess.Popen[bytes]:
-    """Start a rack that runs until it is stopped, and return when it runs."""
+def homing_rack(path: Path, name: str, *words: str) -> AbstractContextManager[str]:
+    """Run a rack that takes commands until the end of the context."""
     path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
-    given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
-    command = [*RACK, "run", str(path), "--no-record", *given]
-    return start_rack(command, name, path.with_suffix(".log"))
-
-
-def end(process: subprocess.Popen[bytes], name: str) -> None:
-    rack("stop", name)
-    process.kill()
-    process.wait()
+    return running_rack(path, name, *words)
 
 
 @pytest.fixture(scope="module", params=["realtime", "lockstep"])
@@ -42,17 +36,15 @@ def running(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[str]:
     """Name of a rack that runs until it is stopped."""
-    name = f"test-command-{request.param}-{os.getpid()}"
+    mode, path = request.param, tmp_path_factory.mktemp("rack") / "told.toml"
     # An operator is silent after a second of simulated time: a process of a busy machine must not
     # be.
-    slow = ("clock.speed=0.25",) if request.param == "realtime" else ()
-    settings = (f"clock.mode={request.param}", *slow)
-    process = start(tmp_path_factory.mktemp("rack") / "told.toml", name, *settings)
-    yield name
-    end(process, name)
+    slow = ("--set=clock.speed=0.25",) if mode == "realtime" else ()
+    words = (f"--set=clock.mode={mode}", *slow)
+    with homing_rack(path, f"test-command-{mode}-{os.getpid()}", *words) as name:
+        yield name
 
 
-@pytest.mark.slow
 def test_a_command_is_given_and_taken_up(running: str) -> None:
     answer = read_answer("command", running, "upper", "hold")
     assert (answer["level"], answer["text"], answer["worked"]) == ("upper", "hold", True)
@@ -66,7 +58,6 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
     assert line.startswith(f"command {answer['serial'] + 1} to 'upper', resume: given at tick ")
 
 
-@pytest.mark.slow
 def test_waiting_lasts_until_the_command_is_done_and_tells_how_to_end_it(running: str) -> None:
     answer = read_answer("command", running, "upper", "hold", "--wait")
     assert answer["fate"] == "done"
@@ -88,16 +79,11 @@ def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """A process that waits for the end of its command, and the serial of the command."""
     words = Segment.attach(name).words
     given = words[System.COMMANDED]
-    command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]
-    with Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            wait_until(lambda: words[System.COMMANDED] > given)
-            yield process, given + 1
-        finally:
-            process.kill()
+    with started("command", name, "lower", "goto", "home", "--wait", "--json") as process:
+        wait_until(lambda: words[System.COMMANDED] > given)
+        yield process, given + 1
 
 
-@pytest.mark.slow
 def test_a_wait_continues_while_another_operator_sets_a_parameter(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("set", running, "board.lower.params.by=2").returncode == 0
@@ -110,7 +96,6 @@ def test_a_wait_continues_while_another_operator_sets_a_parameter(running: str) 
     assert rack("command", running, "lower", "resume").returncode == 0
 
 
-@pytest.mark.slow
 def test_a_wait_ends_when_another_command_supersedes_its_command(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("command", running, "lower", "resume").returncode == 0
@@ -118,17 +103,22 @@ def test_a_wait_ends_when_another_command_supersedes_its_command(running: str) -
     assert (answer["serial"], answer["fate"]) == (serial, "superseded")
 
 
-@pytest.mark.slow
+@contextmanager
+def leasing(name: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that has leased a hold of the upper level."""
+    with started("command", name, "upper", "hold", "--lease") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("command ")
+        yield process
+
+
 @pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
     running: str, gone: signal.Signals
 ) -> None:
     segment = Segment.attach(running)
-    hold = [*RACK, "command", running, "upper", "hold", "--lease"]
     with AttachedRack(running) as live:
-        with Popen(hold, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            line = process.stdout.readline()
+        with leasing(running) as process:
             modes = {row.task: row.mode for row in live.status().tasks}
             given = segment.words[System.COMMANDED]
             process.send_signal(gone)
@@ -139,8 +129,6 @@ def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
                 assert OperatorTable(segment).list_leased()
                 process.kill()
             event = live.wait_for("operator_gone", BOUND_S)
-            process.kill()
-        assert line.startswith("command ")
         assert modes == {"upper": "operator", "lower": "automatic"}
         text = f"hold: its operator is gone: hold (command {given + 1})"
         assert (event.board, event.text) == ("upper", text)
@@ -148,23 +136,18 @@ def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
     assert rack("command", running, "upper", "resume").returncode == 0
 
 
-@pytest.mark.slow
 def test_a_lease_ends_when_another_command_supersedes_it(running: str) -> None:
     segment = Segment.attach(running)
-    upper = [*RACK, "command", running, "upper", "hold", "--lease"]
-    with Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("command ")
+    with leasing(running) as process:
         # Refused, so the hold is still in force; then taken.
         assert rack("command", running, "upper", "goto", "home").returncode == 1
         assert process.poll() is None
         assert rack("command", running, "upper", "resume").returncode == 0
         assert process.wait(BOUND_S) == 0
     assert not OperatorTable(segment).list_leased()
-    assert LevelCommander(Segment.attach(running)).list_highest_levels("hold") == []
+    assert LevelCommander(segment).list_highest_levels("hold") == []
 
 
-@pytest.mark.slow
 def test_a_paused_rack_continues_from_its_tick(running: str) -> None:
     words = Segment.attach(running).words
     paused = read_answer("pause", running)
@@ -185,7 +168,6 @@ def test_a_paused_rack_continues_from_its_tick(running: str) -> None:
     assert read_refusal(rack("resume", running), status=1) == f"rack '{running}' is not paused"
 
 
-@pytest.mark.slow
 def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
     answer = read_answer("set", running, "board.lower.params.by=2")
     assert (answer["text"], answer["fate"]) == ("set by=2", "done")
@@ -204,23 +186,22 @@ def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
     commanded: Path, rack_name: str
 ) -> None:
-    options = ("--no-record", "--json", "--seconds", "0.4", "--set", f"name={rack_name}")
-    run = ("run", commanded, *options)
-    held = Popen([*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    wait_until(lambda: rack_name in list_racks() and Segment.attach(rack_name).words[System.HELD])
-    given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
-    assert given.returncode == 0
-    assert " set by=3: waits: the rack is held before" in given.stdout
-    assert rack("resume", rack_name).returncode == 0
-    answer, _ = held.communicate(timeout=BOUND_S)
+    run = ("run", commanded, "--no-record", "--seconds", "0.4", "--set", f"name={rack_name}")
+    with started(*run, "--json", "--step") as held:
+        wait_until(
+            lambda: rack_name in list_racks() and Segment.attach(rack_name).words[System.HELD]
+        )
+        given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
+        assert given.returncode == 0
+        assert " set by=3: waits: the rack is held before" in given.stdout
+        assert rack("resume", rack_name).returncode == 0
+        answer, _ = held.communicate(timeout=BOUND_S)
     command = commands("level='lower', what='set', name='by=3', tick=101")
-    repeated = rack(*run, "--set", command).stdout
-    digests = [json.loads(text)["digest"] for text in (answer, repeated, rack(*run).stdout)]
-    assert digests[0] == digests[1] != digests[2]
+    repeated, plain = read_answer(*run, "--set", command), read_answer(*run)
+    assert json.loads(answer)["digest"] == repeated["digest"] != plain["digest"]
 
 
 REFUSED = {
@@ -239,23 +220,20 @@ REFUSED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("running", ["lockstep"], indirect=True)
 @pytest.mark.parametrize(("words", "reason"), REFUSED.items(), ids=REFUSED)
 def test_bad_usage_is_one_line_and_status_2(running: str, words: str, reason: str) -> None:
     assert reason in read_refusal(rack("command", running, *words.split()))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
     running: str, end: signal.Signals
 ) -> None:
     table = OperatorTable(Segment.attach(running))
-    command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
-    process = Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    wait_until(table.list_waiting)
-    process.send_signal(end)
-    process.communicate(timeout=BOUND_S)
-    assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
+    with started("command", running, "upper", "hold", "--tick", 10**9) as process:
+        wait_until(table.list_waiting)
+        process.send_signal(end)
+        process.communicate(timeout=BOUND_S)
+        assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
     assert table.list_waiting() == []

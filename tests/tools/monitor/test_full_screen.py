@@ -16,7 +16,7 @@ from rack.backplane.segment import Segment, list_racks
 from rack.tools.monitor.full_screen import RackScreen
 from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
-from tests.tools.monitor.test_desk import end, start
+from tests.tools.monitor.test_desk import homing_rack
 
 pytestmark = pytest.mark.slow
 
@@ -24,10 +24,9 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The name of a rack that runs until the last test stops it."""
-    name = f"test-screen-{os.getpid()}"
-    process = start(tmp_path_factory.mktemp("rack") / "commanded.toml", name)
-    yield name
-    end(process, name)
+    path = tmp_path_factory.mktemp("rack") / "commanded.toml"
+    with homing_rack(path, f"test-screen-{os.getpid()}") as name:
+        yield name
 
 
 def on_screen(

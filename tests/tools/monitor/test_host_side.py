@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +17,14 @@ from rack.tools.monitor.host_side import EntryRow, list_entry_rows
 from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
-from tests.processes import RACK
-from tests.tools.command_line import rack, read_answer, read_refusal
+from tests.tools.command_line import rack, read_answer, read_refusal, started
 from tests.tools.conftest import MakeSegment
-from tests.warm import Popen
 
 
 @pytest.fixture
-def hosted(tmp_path: Path) -> Path:
+def hosted(write: Callable[[str, str], Path]) -> Path:
     """A config file of a rack with a host board."""
-    path = tmp_path / "hosted.toml"
-    path.write_text(HOSTED)
-    return path
+    return write("hosted.toml", HOSTED)
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +60,12 @@ def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     hosted: Path, rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:
     run, first = recorded
-    out = ("--entries", run, "--out", tmp_path / "again", "--json")
-    again = json.loads(rack("run", hosted, "--set", f"name={rack_name}", *out).stdout)
+    out = ("--entries", run, "--out", tmp_path / "again")
+    again = read_answer("run", hosted, "--set", f"name={rack_name}", *out)
     assert [report["outcome"]["cause"] for report in (first, again)] == ["task done"] * 2
     assert first["digest"] == again["digest"]
     assert first["entries"] == again["entries"]
@@ -115,31 +108,17 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     assert read_refusal(none) == f"--entries {run}: '{rack_name}' has no adapter"
 
 
-@contextmanager
-def console(hosted: Path, name: str) -> Iterator[Rack]:
-    """Run a rack with an external host board."""
-    external = ["host.program.external=true", "host.program.program=host_programs:Console"]
-    with Rack(load(hosted, [f"name={name}", *external])) as running:
-        running.start()
-        yield running
-
-
 @pytest.mark.slow
 def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
     hosted: Path, rack_name: str
 ) -> None:
-    with console(hosted, rack_name) as running:
+    external = ["host.program.external=true", "host.program.program=host_programs:Console"]
+    with Rack(load(hosted, [f"name={rack_name}", *external])) as running:
+        running.start()
         assert any("--entries RUN repeats a run" in event.text for event in running.events)
-        first = Popen(
-            [*RACK, "prompt", rack_name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            bufsize=1,
-        )
-        assert first.stdin is not None
-        assert first.stdout is not None
-        with first:
+        with started("prompt", rack_name, bufsize=1, stderr=None) as first:
+            assert first.stdin is not None
+            assert first.stdout is not None
             first.stdin.write("number(4)\nprint('sent')\n")
             while "sent" not in first.stdout.readline():
                 continue
@@ -147,7 +126,6 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
             assert read_refusal(rack("prompt", rack_name), status=1) == why
             status = rack("status", rack_name).stdout
             assert f"program  {first.pid}  running     1         0" in status
-            first.kill()
         # A prompt that was killed leaves its place to the next one.
         script = hosted.parent / "more.py"
         script.write_text(

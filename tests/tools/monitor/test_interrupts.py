@@ -10,23 +10,10 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.monitor.interrupts import replay_inbox
-from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 from tests.boards.messages import Written
 from tests.boards.run.test_interrupts import BOARDS, OVERLOADED, RACK, SECONDS, SMALL, TICKS
-from tests.tools.recordings import recorded as write_recording
-
-
-def recorded(folder: Path, name: str, *settings: str) -> Recording:
-    """Run the rack for these tests, and return its recording. No recorder process is started."""
-    path = folder / "hub.toml"
-    path.write_text(RACK)
-    config = load(path, [f"name={name}", *settings])
-    with Rack(config) as rack:
-        rack.run(SECONDS)
-        found = Written.on(rack.segment)
-    traces = {task: rows.tolist() for task, rows in found.cycles.items()}
-    return write_recording(folder / "run", config, traces, messages=found.messages)
+from tests.tools.recordings import recorded
 
 
 @pytest.mark.slow
@@ -34,7 +21,15 @@ def recorded(folder: Path, name: str, *settings: str) -> Recording:
 def test_recording_and_report_agree_with_the_inbox_of_the_board(
     tmp_path: Path, rack_name: str, settings: tuple[str, ...]
 ) -> None:
-    recording = recorded(tmp_path, rack_name, *settings)
+    path = tmp_path / "hub.toml"
+    path.write_text(RACK)
+    config = load(path, [f"name={rack_name}", *settings])
+    # No recorder process is started.
+    with Rack(config) as rack:
+        rack.run(SECONDS)
+        found = Written.on(rack.segment)
+    traces = {task: rows.tolist() for task, rows in found.cycles.items()}
+    recording = recorded(tmp_path / "run", config, traces, messages=found.messages)
     slot = recording.layout.find_task("hub").slot
     arrivals = replay_inbox(recording, slot)
     names = [box.name for box in recording.layout.list_interrupting_mailboxes(slot)]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pytest
 from rich.console import Console
 
+from rack.backplane.mailbox.history import build_row_dtype
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.segment import Segment
+from rack.boards.config import resolve_layout
 from rack.boards.config.loader import load_text
 from rack.levels.peer import Presence
 from rack.tools.monitor.display import RackView
@@ -29,6 +29,7 @@ from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.report.report import summarize_network
 from tests.boards.lan.racks import rack_text
 from tests.tools.conftest import MakeSegment
+from tests.tools.recordings import recorded
 
 TEXT = rack_text(
     "one", "tcp/127.0.0.1:7447", [], "other-one", peers=["third"], lan='on_peer_loss = "go on"'
@@ -45,11 +46,11 @@ COUNTS = {
 }
 
 
-@pytest.fixture
-def segment(rack_name: str, make_segment: MakeSegment) -> Segment:
-    """Segment of a rack whose adapter has exchanged messages for a while."""
-    made = make_segment(load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"')))
-    status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
+def test_a_running_rack_shows_peers_imports_and_exports(
+    rack_name: str, make_segment: MakeSegment
+) -> None:
+    segment = make_segment(load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"')))
+    status, peer = open_writer(segment, "lan.status"), open_writer(segment, "lan.peer_other_one")
     status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04, 0.5)
     status.message.export_pulse[...] = (12, 24)
     status.write(8)
@@ -57,10 +58,6 @@ def segment(rack_name: str, make_segment: MakeSegment) -> Segment:
     found.presence, found.launches, found.losses, found.since = Presence.LOST, 2, 1, 400
     found.offset, found.uncertainty = -0.5, 0.0002
     peer.write(8)
-    return made
-
-
-def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:
     newest = NewestMessages(segment)
     assert [*list_peers(newest)] == [PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2)]
     taken = ImportRow(
@@ -76,32 +73,20 @@ def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> Non
     assert not any(read_entries('name = "alone"'))
 
 
-class Recorded:
-    """Stands in for a recording with three cycles of the adapter."""
-
-    mailboxes = ("lan.status",)
-
-    def __init__(self, segment: Segment) -> None:
-        self.config, self.layout = segment.config, segment.layout
-        self.rack_config = load_text(segment.config)
-
-    def read_signal(self, mailbox: str, field: str) -> np.ndarray:
-        """Return a field of a mailbox."""
-        port, _, name = field.partition(".")
-        if mailbox == "lan.status":
-            values = {
-                "age_s": [-1.0, 0.02, 0.04],
-                "sent": [0, 1, 2],
-                **{key: [0, 0, n] for key, n in COUNTS.items()},
-            }
-            return np.array(values[name])
-        peer = {"presence": [1, 2, 2], "launches": [1, 1, 2], "losses": [0, 1, 1]}
-        return np.array(peer[port] if mailbox == "lan.peer_other_one" else [0, 0, 0])
-
-
-def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
-    recording: Any = Recorded(segment)
-    found = summarize_network(recording)
+def test_a_report_has_counts_ages_and_losses(tmp_path: Path) -> None:
+    config = load_text(TEXT)
+    layout = resolve_layout(config)
+    rows = {
+        name: np.zeros(3, build_row_dtype(layout.find_mailbox(name)))
+        for name in ("lan.status", "lan.peer_other_one", "lan.peer_third")
+    }
+    status, peer = (rows[name]["message"] for name in ("lan.status", "lan.peer_other_one"))
+    status["import_other"]["age_s"] = [-1.0, 0.02, 0.04]
+    status["export_pulse"]["sent"] = [0, 1, 2]
+    for name, count in COUNTS.items():
+        status["import_other"][name][2] = count
+    peer["presence"], peer["launches"], peer["losses"] = [1, 2, 2], [1, 1, 2], [0, 1, 1]
+    found = summarize_network(recorded(tmp_path / "run", config, {}, messages=rows))
     assert found is not None
     (entry,) = found["imports"]
     assert {name: entry[name] for name in COUNTS} == COUNTS

@@ -20,16 +20,16 @@ def link(rack_name: str) -> Iterator[Link]:
 
 
 @pytest.fixture
-def signals(link: Link) -> list[Signal]:
+def history(link: Link) -> SignalHistory:
     """Two signals of its mailbox."""
     boxes = link.segment.layout.mailboxes
-    return [Signal.parse(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
+    signals = [Signal.parse(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
+    return SignalHistory(link.segment, signals, span=20)
 
 
 def test_every_message_is_read_once_and_overwritten_ones_are_counted(
-    link: Link, signals: list[Signal]
+    link: Link, history: SignalHistory
 ) -> None:
-    history = SignalHistory(link.segment, signals, span=20)
     taken: list[tuple[int, int]] = []
     for first in range(0, 60, 20):
         link.run(first, first + 20)
@@ -44,16 +44,15 @@ def test_every_message_is_read_once_and_overwritten_ones_are_counted(
 
 
 def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
-    link: Link, signals: list[Signal]
+    link: Link, history: SignalHistory
 ) -> None:
-    strip = SignalHistory(link.segment, signals, span=20)
     link.run(0, 40)
-    strip.read_new()
-    assert strip.list_rows(10, 15) == [(10, (10, 10)), (12, (12, 12)), (14, (14, 14))]
+    history.read_new()
+    assert history.list_rows(10, 15) == [(10, (10, 10)), (12, (12, 12)), (14, (14, 14))]
     for first in range(40, 400, 40):
         link.run(first, first + 40)
-        strip.read_new()
-    kept = strip.list_rows(0, 400)
+        history.read_new()
+    kept = history.list_rows(0, 400)
     assert kept[-1] == (398, (398, 398))
     # The span, and as much as one reading may bring: the ring, and what is being written. The
     # oldest block of 40 ticks may reach further back.
@@ -61,10 +60,9 @@ def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
     assert first - 40 <= kept[0][0] < first
 
 
-def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Signal]) -> None:
-    strip = SignalHistory(link.segment, signals, span=20)
-    assert strip.list_rows(0, 10) == []
+def test_a_signal_keeps_its_value_between_messages(link: Link, history: SignalHistory) -> None:
+    assert history.list_rows(0, 10) == []
     link.run(0, 8)
-    strip.read_new()
-    assert strip.list_rows(5, 6) == [(6, (6, 6))]
-    assert strip.to_time_s(6) == 0.015
+    history.read_new()
+    assert history.list_rows(5, 6) == [(6, (6, 6))]
+    assert history.to_time_s(6) == 0.015

@@ -12,8 +12,9 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import NamedTuple
 
 import pytest
@@ -26,9 +27,9 @@ from rack.tools.network.certificates import make_credentials
 from rack.tools.network.estop import check_reach
 from rack.tools.viewer.window import find_free_port
 from tests.boards.commanded_racks import COMMANDED
-from tests.processes import BOUND_S, RACK, wait_until
-from tests.tools.command_line import ROOT, rack
-from tests.warm import Popen
+from tests.processes import BOUND_S, wait_until
+from tests.tools.command_line import rack, started
+from tests.tools.held_racks import running_rack
 
 pytestmark = pytest.mark.thorough
 
@@ -58,25 +59,18 @@ class Far(NamedTuple):
         return self.address.partition("/")[0]
 
 
-class Ended(NamedTuple):
-    """How a command ended."""
-
-    status: int
-    out: str
-    err: str
-
-
-def afar(*commands: str) -> list[Ended]:
+def afar(*commands: str) -> list[CompletedProcess[str]]:
     """Run commands, each as one text in a process of its own, all at once."""
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    started = [
-        Popen([*RACK, *command.split()], cwd=ROOT, text=True, **pipes) for command in commands
-    ]
     with ExitStack() as stack:
-        for process in started:
-            stack.callback(process.kill)
-        texts = [process.communicate(timeout=BOUND_S) for process in started]
-    return [Ended(one.returncode, *text) for one, text in zip(started, texts, strict=True)]
+        processes = [
+            stack.enter_context(started(*command.split(), stdin=subprocess.DEVNULL))
+            for command in commands
+        ]
+        texts = [process.communicate(timeout=BOUND_S) for process in processes]
+    return [
+        CompletedProcess(one.args, one.returncode, *text)
+        for one, text in zip(processes, texts, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -84,44 +78,28 @@ def far(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
     """A rack on this machine that runs until it is stopped, to be reached by its address."""
     folder = tmp_path_factory.mktemp("far")
     name, port = f"test-afar-{os.getpid()}", find_free_port()
-    peer = f"{name}-peer"
-    config, log = folder / "far.toml", folder / "log"
+    peer, config = f"{name}-peer", folder / "far.toml"
     config.write_text(COMMANDED + OF_LAN.format(port=port, peer=peer))
     people = dict.fromkeys((peer, "operator", "nobody"), ())
     make_credentials(folder / "certs", {name: ["127.0.0.1"], **people}, 1)
-    command = [*RACK, "run", str(config), "--no-record", f"--set=name={name}"]
-    with log.open("w") as out, pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RACK_CERTIFICATES", str(folder / "certs"))
-        process = Popen([*command, "--set=clock.mode=realtime"], cwd=ROOT, stdout=out, stderr=out)
-        try:
-            wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
-            assert process.poll() is None, log.read_text()
-            yield Far(name, f"127.0.0.1:{port}/{name}", log)
-        finally:
-            rack("stop", name)
-            process.kill()
-            process.communicate()
+        with running_rack(config, name, "--set=clock.mode=realtime"):
+            yield Far(name, f"127.0.0.1:{port}/{name}", folder / f"{name}.log")
 
 
-@contextmanager
-def client(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a command in a process of its own, which is killed at the end, should it still run."""
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    process = Popen([*RACK, *words], cwd=ROOT, text=True, **pipes)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+@pytest.fixture
+def segment(far: Far) -> Iterator[Segment]:
+    """Memory of the rack that runs."""
+    with closing(Segment.attach(far.name)) as segment:
+        yield segment
 
 
-@pytest.mark.slow
 @pytest.mark.alone
-def test_a_remote_emergency_stop_is_reset_at_the_rack(far: Far) -> None:
-    segment = Segment.attach(far.name)
+def test_a_remote_emergency_stop_is_reset_at_the_rack(far: Far, segment: Segment) -> None:
     (stopped,) = afar(f"estop {far.address} --json")
-    assert (stopped.status, stopped.err) == (0, "")
-    answer = json.loads(stopped.out)
+    assert (stopped.returncode, stopped.stderr) == (0, "")
+    answer = json.loads(stopped.stdout)
     assert (answer["rack"], answer["emergency_stop"]) == (far.name, True)
     assert segment.words[System.EMERGENCY_STOP] == 1
     wait_until(
@@ -129,12 +107,10 @@ def test_a_remote_emergency_stop_is_reset_at_the_rack(far: Far) -> None:
     )
     assert rack("estop", far.name, "--reset").returncode == 0
     assert segment.words[System.EMERGENCY_STOP] == 0
-    segment.close()
 
 
-@pytest.mark.slow
 @pytest.mark.alone
-def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far) -> None:
+def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far, segment: Segment) -> None:
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
     where = "--ready only stops a rack on another machine, HOST/RACK"
     peer = f"{far.name}-peer"
@@ -161,10 +137,9 @@ def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far) -> None:
         ),
     }
     ended = afar(*refused)
-    assert [(one.status, one.err.splitlines()[-1]) for one in ended] == [*refused.values()]
-    segment = Segment.attach(far.name)
+    found = [(one.returncode, one.stderr.splitlines()[-1]) for one in ended]
+    assert found == [*refused.values()]
     assert segment.words[System.EMERGENCY_STOP] == 0
-    segment.close()
 
 
 @contextmanager
@@ -195,12 +170,12 @@ def shaking_hands(port: int) -> Iterator[Callable[[], int]]:
             ended.set()
 
 
-@pytest.mark.slow
 @pytest.mark.alone
-def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> None:
-    segment = Segment.attach(far.name)
+def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(
+    far: Far, segment: Segment
+) -> None:
     port = int(far.port.rpartition(":")[2])
-    with client("estop", far.address, "--ready", "--json") as ready, shaking_hands(port) as made:
+    with started("estop", far.address, "--ready", "--json") as ready, shaking_hands(port) as made:
         assert ready.stdin is not None
         assert ready.stderr is not None
         assert ready.stderr.readline() == f"ready to stop rack '{far.address}'\n"
@@ -217,13 +192,11 @@ def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> N
         before = made()
         wait_until(lambda: made() > before)
     assert rack("estop", far.name, "--reset").returncode == 0
-    segment.close()
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_ready_operator_is_told_when_the_run_ends(far: Far) -> None:
-    with client("estop", far.address, "--ready") as ready:
+    with started("estop", far.address, "--ready") as ready:
         assert ready.stderr is not None
         assert ready.stderr.readline().startswith("ready to stop")
         assert rack("stop", far.name).returncode == 0
@@ -232,7 +205,6 @@ def test_a_ready_operator_is_told_when_the_run_ends(far: Far) -> None:
         assert ready.wait(BOUND_S) == 128 + signal.SIGINT
 
 
-@pytest.mark.slow
 def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
     port = find_free_port()
     make_credentials(tmp_path / "certs", {"cell": []}, 1)
@@ -249,7 +221,7 @@ def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
     missing = (
         f"{tmp_path}/certs/stranger.pem: the file is missing; see rack lan certificates --help"
     )
-    assert [one.err.strip() for one in ended] == [
+    assert [one.stderr.strip() for one in ended] == [
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
         f'RACK = "127.0.0.1/X!": {why}',

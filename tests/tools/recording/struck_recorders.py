@@ -47,28 +47,13 @@ class AtTick(Display):
 
     period_s = 0.05
 
-    def __init__(
-        self,
-        number: signal.Signals,
-        tick: int = FIRST_BLOCK,
-        view: Path | None = None,
-        times: int = 1,
-    ) -> None:
-        self._number, self._tick, self._view, self._times = number, tick, view, times
-        self._view_began = 0
+    def __init__(self, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1) -> None:
+        self._number, self._tick, self._times = number, tick, times
         self.struck: list[int] = []
 
-    def _has_view(self) -> bool:
-        """Return True if the viewer's file has grown, or does not matter."""
-        if self._view is None:
-            return True
-        size = self._view.stat().st_size if self._view.is_file() else 0
-        self._view_began = self._view_began or size
-        return size > self._view_began > 0
-
     def show(self, snapshot: Snapshot) -> None:
-        """Look at the tick, and at the viewer's file."""
-        if snapshot.tick > self._tick and len(self.struck) < self._times and self._has_view():
+        """Look at the tick."""
+        if snapshot.tick > self._tick and len(self.struck) < self._times:
             for pid in programs("rack.tools.recording.recorder"):
                 if pid not in self.struck:
                     self.struck.append(pid)

@@ -43,11 +43,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def damaged(run: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(run, tmp_path / "run"))
-
-
 def read_values(folder: Path) -> object:
     """Return everything that a recording says."""
     found = Recording(folder)
@@ -144,7 +139,6 @@ def test_nan_is_null_in_json_and_is_restored() -> None:
         parse_checked_line(line.replace("detection", "Detection"))
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_nan_in_a_sensor_leaves_strict_json(tmp_path: Path, rack_name: str) -> None:
     faults = "fault=[{ kind = 'sensor-nan', board = 'servo', joint = 2, at = 0.5, for = '0.1s' }]"

@@ -15,7 +15,8 @@ from rack.tools.recording.cores import UNMEASURED, CoreMeter, CoreRecord, Stolen
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import build_report
 from rack.tools.report.report_markdown import format_markdown
-from tests.tools.recordings import MS, Cycle, recorded
+from tests.tools.conftest import Record
+from tests.tools.recordings import MS, Cycle
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"
 S = 1_000_000_000
@@ -49,23 +50,20 @@ def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) 
     assert record.lasted_ns > 0
 
 
-def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
+def run(record: Record, measured: CoreRecord) -> Recording:
     """Return a recording in real time with three misses and this record of the cores."""
     late = [Cycle(tick, (0.1, 0.1, 2.6, 0.1), flags=int(Flag.MISSED)) for tick in (10, 20, 30)]
-    found = recorded(
-        folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late}
-    )
-    found.cores = record
+    found = record({"lower": late}, "board.lower.core=1")
+    found.cores = measured
     return found
 
 
-def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path: Path) -> None:
-    empty = run(tmp_path / "run", small, UNMEASURED)
+def test_misses_during_steal_are_counted_by_core_and_time(record: Record) -> None:
+    empty = run(record, UNMEASURED)
     period_ns, core = empty.layout.clock_ns, empty.layout.find_task("lower").core
     during = Stolen(20 * period_ns - MS, 20 * period_ns + MS, core, 10)
     elsewhere = Stolen(30 * period_ns - MS, 30 * period_ns + MS, core + 1, 30)
-    record = CoreRecord(5 * S, (during, elsewhere))
-    report = build_report(run(tmp_path / "run", small, record))
+    report = build_report(run(record, CoreRecord(5 * S, (during, elsewhere))))
     first, second = str(core), str(core + 1)
     assert report["steal"] == {
         "measured": True,
@@ -78,16 +76,15 @@ def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path:
     assert line in format_markdown(report)
 
 
-def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> None:
-    quiet = build_report(run(tmp_path / "run", small, CoreRecord(S, ())))
+def test_a_report_mentions_only_what_happened(record: Record) -> None:
+    quiet = build_report(run(record, CoreRecord(S, ())))
     assert quiet["steal"]["measured"]
     assert "hypervisor" not in format_markdown(quiet)
-    unknown = build_report(run(tmp_path / "run", small, UNMEASURED))
+    unknown = build_report(run(record, UNMEASURED))
     assert not unknown["steal"]["measured"]
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_recording_keeps_what_the_machine_did(
     small: Path, tmp_path: Path, rack_name: str
 ) -> None:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 from rack.backplane.trace import Flag
-from rack.boards.config import RackConfig, load
+from rack.boards.config import load
 from rack.boards.timing.tasks import Budget
-from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cycles import measure_budgets
 from rack.tools.recording.recording import Recording
-from tests.tools.recordings import MS, Cycle, recorded
+from tests.tools.command_line import read_failure
+from tests.tools.conftest import Record
+from tests.tools.recordings import MS, Cycle
 
 PLANNED = int(Flag.PLANNED)
 SETTLED = 40
@@ -25,112 +26,76 @@ SETTLED = 40
 PLAIN = (0.0, 0.1, 1.0, 0.2)
 
 
+Measure = Callable[..., Mapping[str, Budget]]
+
+
 @pytest.fixture
-def config(small: Path) -> RackConfig:
-    """Two levels on one core in real time, the lower one at 400 Hz, with its planner below both."""
-    settings = ["clock.mode=realtime", "board.lower.priority=80", "board.upper.priority=70"]
-    return load(small, settings)
+def measure(record: Record) -> Measure:
+    """Measure the budgets of two levels on one core in real time.
+
+    The lower one runs at 400 Hz, with its planner below both.
+    """
+    priorities = ("board.lower.priority=80", "board.upper.priority=70")
+    return lambda *events, **traces: measure_budgets(record(traces, *priorities, events=events))
 
 
-def test_undisturbed_cycles_have_the_times_of_their_stamps(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_undisturbed_cycles_have_the_times_of_their_stamps(measure: Measure) -> None:
     trace = [
         Cycle(SETTLED + k, (0.05, 0.1, 1.0 + 0.1 * k, 0.2), processor=1.5 + 0.1 * k)
         for k in range(4)
     ]
-    found = measure_budgets(recorded(tmp_path / "run", config, {"lower": trace}))
-    assert found == {
-        "lower": Budget(
-            read_ns=MS // 10, process_ns=1_300_000, write_ns=MS // 5, exchange_ns=MS // 20
-        ),
-    }
+    times = Budget(read_ns=MS // 10, process_ns=1_300_000, write_ns=MS // 5, exchange_ns=MS // 20)
+    assert measure(lower=trace) == {"lower": times}
 
 
-def test_preemption_by_the_executor_is_not_planner_time(config: RackConfig, tmp_path: Path) -> None:
+def test_preemption_by_the_executor_is_not_planner_time(measure: Measure) -> None:
     executor = [Cycle(SETTLED + k, PLAIN) for k in range(4)]
     # Released with the executor's first cycle: 1.3 ms pass before it runs, 1.3 ms each in P and in
     # U.
     plan = Cycle(SETTLED, (0.0, 0.1, 3.1, 2.6), late=1.4, processor=3.2, flags=PLANNED)
-    recording = recorded(tmp_path / "run", config, {"lower": executor, "lower.planner": [plan]})
-    found = measure_budgets(recording)["lower"]
+    found = measure(**{"lower": executor, "lower.planner": [plan]})["lower"]
     # Reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
     assert found.plan_ns == round((0.1 + 1.8) * MS)
     assert found.update_ns == round(1.3 * MS)
 
 
-def test_untraced_time_is_subtracted_from_unusually_long_parts(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_untraced_time_is_subtracted_from_unusually_long_parts(measure: Measure) -> None:
     usual = [Cycle(SETTLED + k, PLAIN) for k in range(10)]
     stolen = Cycle(SETTLED + 10, (0.0, 0.1, 1.0, 1.2), processor=1.3)
-    found = measure_budgets(recorded(tmp_path / "run", config, {"lower": [*usual, stolen]}))[
-        "lower"
-    ]
+    found = measure(lower=[*usual, stolen])["lower"]
     assert (found.process_ns, found.write_ns) == (MS, MS // 5)
 
 
-def test_the_start_up_of_a_process_is_not_counted(config: RackConfig, tmp_path: Path) -> None:
+def test_the_start_up_of_a_process_is_not_counted(measure: Measure) -> None:
     cold = (0.0, 0.1, 2.2, 0.2)
     ticks = [*range(60), *range(80, 140)]
-    trace = [Cycle(tick, cold if tick in (0, 39, 80, 119) else PLAIN) for tick in ticks]
     event = {"kind": "recovery", "code": "rejoined", "time_ns": 0, "text": ""}
     rejoined, other = event | {"board": "lower", "tick": 80}, event | {"board": "upper", "tick": 45}
-    found = measure_budgets(
-        recorded(tmp_path / "run", config, {"lower": trace}, [rejoined, other])
-    )["lower"]
-    assert found.process_ns == MS
-    late = [Cycle(tick, cold if tick == 45 else PLAIN) for tick in ticks]
-    found = measure_budgets(
-        recorded(tmp_path / "late", config, {"lower": late}, [rejoined, other])
-    )["lower"]
-    assert found.process_ns == 2_200_000
+    for cold_ticks, process_ns in (((0, 39, 80, 119), MS), ((45,), 2_200_000)):
+        trace = [Cycle(tick, cold if tick in cold_ticks else PLAIN) for tick in ticks]
+        assert measure(rejoined, other, lower=trace)["lower"].process_ns == process_ns
 
 
-def test_a_recording_without_the_new_times_is_refused_in_one_line(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    folder = recorded(tmp_path / "run", config, {"lower": [Cycle(SETTLED, PLAIN)]}).folder
+def test_a_recording_without_the_new_times_is_refused_in_one_line(record: Record) -> None:
+    folder = record({"lower": [Cycle(SETTLED, PLAIN)]}).folder
     table = pq.read_table(folder / "cycles.parquet")
     pq.write_table(table.drop_columns(["plan_ns", "processor_ns"]), folder / "cycles.parquet")
     Checksums(folder).store("cycles.parquet")
-    with pytest.raises(Failure, match="no column 'plan_ns'") as refused:
-        Recording(folder)
-    assert refused.value.status == 2
-    assert "\n" not in str(refused.value)
-
-
-@pytest.fixture(scope="module")
-def measured_run(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Recording:
-    """A run of fig2 with an executor of 1 ms, in the mode that the fixture's parameter names."""
-    folder = tmp_path_factory.mktemp("figure") / "run"
-    settings = [
-        f"name=test-cycles-{os.getpid()}",
-        f"clock.mode={request.param}",
-        "board.level.params.process_ms=1.0",
-    ]
-    assert run_rack(load("fig2", settings), 0.8, folder, Display()).outcome.cause == "time over"
-    return Recording(folder)
+    assert "no column 'plan_ns'" in read_failure(Recording, folder)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "measured_run",
-    [pytest.param("realtime", marks=pytest.mark.thorough), "lockstep"],
-    indirect=True,
-)
-def test_measured_times_match_known_computing_times(measured_run: Recording) -> None:
+@pytest.mark.parametrize("mode", [pytest.param("realtime", marks=pytest.mark.thorough), "lockstep"])
+def test_measured_times_match_known_computing_times(
+    rack_name: str, tmp_path: Path, mode: str
+) -> None:
+    settings = (f"clock.mode={mode}", "board.level.params.process_ms=1.0")
+    config = load("fig2", [f"name={rack_name}", *settings])
+    assert run_rack(config, 0.8, tmp_path / "run", Display()).outcome.cause == "time over"
     # Use the median, so that a host that takes the machine away does not fail this test.
-    found = measure_budgets(measured_run, 50.0)["level"]
-    expected = {
-        "read_ns": 1.0,
-        "process_ns": 1.0,
-        "write_ns": 1.0,
-        "plan_ns": 6.0,
-        "update_ns": 1.0,
-    }
+    found = measure_budgets(Recording(tmp_path / "run"), 50.0)["level"]
+    ones = dict.fromkeys(("read_ns", "process_ns", "write_ns", "update_ns"), 1.0)
+    expected = {**ones, "plan_ns": 6.0}
     # Each access and each reading of the clock adds some time.
     assert {name: getattr(found, name) / MS for name in expected} == pytest.approx(
         expected, rel=0.08, abs=0.15

@@ -36,7 +36,7 @@ from rack.tools.viewer.reading import read_component
 from tests.conftest import SMALL
 from tests.tools.recording.struck_recorders import Held
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 SECOND = 400
 """Ticks."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -20,9 +19,9 @@ from rack.tools.launch.verdict import list_failures
 from rack.tools.monitor.display import Display
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recording import Recording
-from tests.processes import children_of
+from tests.processes import children_of, run_to_end
 from tests.tools.command_line import BOUND_S, rack
-from tests.tools.recording.struck_recorders import LONG_S, FillingDisk, Keeping, realtime
+from tests.tools.recording.struck_recorders import LONG_S, FillingDisk, Keeping, notes_of, realtime
 
 pytestmark = pytest.mark.thorough
 
@@ -30,27 +29,27 @@ FULL_S = 40.0
 """Bound of the end of a run whose disk is full: well below what it would last."""
 
 
-@pytest.mark.slow
-def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
+def full_file(folder: Path, name: str) -> Path:
+    """Return the folder of a run in which a file is on a full disk."""
     folder.mkdir()
-    (folder / "run.rrd").symlink_to("/dev/full")
+    (folder / name).symlink_to("/dev/full")
+    return folder
+
+
+def test_a_full_disk_ends_the_view_and_nothing_else(config: RackConfig, tmp_path: Path) -> None:
+    folder = full_file(tmp_path / "run", "run.rrd")
     result = run_rack(config, 5.0, folder, Display())
     recording = Recording(folder)
     assert result.worked
     assert result.recording == "complete"
     assert len(recording.cycles["lower"]) == 2000
-    lines = [event["text"] for event in recording.events if event["kind"] == "recorder"]
-    assert len(lines) == 1
-    assert lines[0].startswith("run.rrd ends here: ")
+    (line,) = notes_of(recording)
+    assert line.startswith("run.rrd ends here: ")
 
 
-@pytest.mark.slow
 def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: Path) -> None:
-    folder, display = tmp_path / "run", Keeping()
-    folder.mkdir()
-    (folder / "events.jsonl").symlink_to("/dev/full")
-    result = run_rack(config, 0.5, folder, display)
+    display = Keeping()
+    result = run_rack(config, 0.5, full_file(tmp_path / "run", "events.jsonl"), display)
     assert (result.outcome.is_success, result.worked) == (True, False)
     assert list_failures(result.outcome, result.recording, result.failed) == [
         "the recording is incomplete: events.jsonl ends before the run"
@@ -58,7 +57,6 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     config: RackConfig, tmp_path: Path, mode: str
@@ -79,7 +77,6 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     assert set(children_of(os.getpid())) <= before
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "why"),
     [
@@ -90,14 +87,12 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
 def test_a_disk_that_is_full_from_the_start_ends_the_run(
     config: RackConfig, tmp_path: Path, name: str, why: str
 ) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / name).symlink_to("/dev/full")
+    folder = full_file(tmp_path / "run", name)
     with pytest.raises(Failure, match=why):
-        run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
+        run_rack(config, 5 * LONG_S, folder, Display())
     assert config.name not in list_racks()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.getuid() != 0, reason="only root mounts a file system")
 @pytest.mark.parametrize(
     ("size", "mode"), [("48k", "realtime"), ("100k", "lockstep"), ("400k", "realtime")]
@@ -115,14 +110,13 @@ def test_a_small_disk_ends_the_run_with_one_line_and_leaves_no_process(
         *("--set", f"name={rack_name}", "--set", f"clock.mode={mode}"),
         *("--seconds", str(5 * LONG_S), "--out", disk / "run"),
     )
-    done = subprocess.run(command, capture_output=True, text=True, timeout=BOUND_S, check=False)
+    done = run_to_end(command, BOUND_S)
     assert done.returncode == 1, done
     *_, last = done.stderr.splitlines()
     assert last.startswith(f"{disk}/run: No space left on device")
     assert rack_name not in list_racks()
 
 
-@pytest.mark.slow
 def test_a_run_whose_report_cannot_be_written_fails(
     small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,8 +124,7 @@ def test_a_run_whose_report_cannot_be_written_fails(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("rack.tools.report.report.write_report", fail)
-    done = rack(
-        *("run", small, "--seconds", 0.2, "--set", f"name={rack_name}", "--out", tmp_path / "run")
-    )
+    words = ("--seconds", 0.2, "--set", f"name={rack_name}", "--out", tmp_path / "run")
+    done = rack("run", small, *words)
     assert done.returncode == 1
     assert f"{tmp_path}/run: no report: [Errno 28] No space left on device" in done.stderr

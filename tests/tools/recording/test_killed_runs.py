@@ -20,27 +20,23 @@ from rerun.chunk import RrdReader
 
 from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import Run, System
+from rack.boards.config.toml import to_toml
+from rack.tools.console.interrupt import list_descendants
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.parts import FILE, list_parts
 from tests.conftest import SMALL
 from tests.machine import run_undisturbed
-from tests.processes import RACK, children_of, wait_until
+from tests.processes import RACK, wait_until
 from tests.warm import Popen, run_command
 
 pytestmark = [
     pytest.mark.alone,
     pytest.mark.thorough,
-    pytest.mark.slow,
     # A viewer's file that was cut off is read to its last whole block.
     pytest.mark.filterwarnings("ignore:RRD file has no footer"),
 ]
 
-FLIGHT = """
-[record]
-keep = "2 s"
-before = "0.5 s"
-after = "0.5 s"
-"""
+FLIGHT = to_toml({"record": {"keep": "2 s", "before": "0.5 s", "after": "0.5 s"}})
 TICKS_A_SECOND = 400
 RUN_S = 4.0
 LATEST_S = 2.5
@@ -48,11 +44,6 @@ LATEST_S = 2.5
 BOUND_S = 60.0
 IN_TIME = 80
 """Ticks by which a recorder that has its share of the machine is behind at most: 0.2 s."""
-
-
-def list_process_family(pid: int) -> list[int]:
-    """Return a process and all its descendants."""
-    return [pid, *(one for child in children_of(pid) for one in list_process_family(child))]
 
 
 class Killed(NamedTuple):
@@ -91,7 +82,7 @@ def kill_run(folder: Path, name: str, victim: str, seed: int, record: str = "") 
         struck = {
             "recorder": [recorder],
             "launcher": [process.pid],
-            "all": list_process_family(process.pid),
+            "all": [process.pid, *list_descendants(process.pid)],
         }
         tick = segment.words[System.TICK]
         behind = tick - segment.words[System.FOLLOWER_TICK]

@@ -15,7 +15,7 @@ from rack.boards.config import load
 from rack.tools.recording.occasions import Occasions, Retention
 from rack.tools.recording.spool import open_rings
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 
 def build_trace(flags: list[int]) -> np.ndarray:
@@ -32,23 +32,23 @@ def test_misses_holds_and_alarms_except_commands_are_occasions(small: Path, rack
         segment = rack.segment
         occasions = Occasions(segment)
         assert list(occasions.find_alarm_ticks()) == []
-        assert list(occasions.find_occasion_ticks("lower", build_trace([0, 0]))) == []
-        missed = build_trace([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])
-        assert list(occasions.find_occasion_ticks("lower", missed)) == [101, 103]
+
+        def find(ring: str, rows: np.ndarray) -> list[int]:
+            return list(occasions.find_occasion_ticks(ring, rows))
+
+        assert find("lower", build_trace([0, 0])) == []
+        assert find("lower", build_trace([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])) == [101, 103]
         rack.run(0.1)
         status = open_rings(segment)["lower.status"].read_new_rows().rows.copy()
         status["message"]["state"] = State.EXECUTING
-        assert list(occasions.find_occasion_ticks("lower.status", status)) == []
+        ticks = status["tick"].tolist()
+        assert find("lower.status", status) == []
         # A hold begins, lasts beyond the end of the drained rows, and ends.
         status["message"]["state"][-3:] = State.HOLDING
-        assert list(occasions.find_occasion_ticks("lower.status", status)) == [
-            int(status["tick"][-3])
-        ]
+        assert find("lower.status", status) == [ticks[-3]]
         status["message"]["state"][:2] = State.HOLDING
         status["message"]["state"][-3:] = State.EXECUTING
-        assert list(occasions.find_occasion_ticks("lower.status", status)) == [
-            int(status["tick"][2])
-        ]
+        assert find("lower.status", status) == [ticks[2]]
         bell = AlarmWriter(segment, "upper")
         for tick, alarm in ((7, Alarm.COLLISION), (8, Alarm.COMMANDED), (9, Alarm.REJOINED)):
             bell.raise_alarm(tick, alarm)

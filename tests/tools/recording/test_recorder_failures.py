@@ -37,7 +37,6 @@ pytestmark = pytest.mark.thorough
 WATCHDOG_S = 60.0
 
 
-@pytest.mark.slow
 def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -59,7 +58,6 @@ def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_a_stopped_recorder_is_replaced_without_losing_rows(
     config: RackConfig, tmp_path: Path, mode: str
@@ -79,7 +77,6 @@ def test_a_stopped_recorder_is_replaced_without_losing_rows(
     assert rows == result.outcome.ticks or mode == "realtime"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
@@ -94,7 +91,6 @@ def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     assert mode == "realtime" or notes[1] == "the recorder has begun"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "board"),
     [
@@ -119,7 +115,6 @@ def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
     assert np.all(np.diff(serials) > 0)
 
 
-@pytest.mark.slow
 def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -153,7 +148,6 @@ def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     assert f"lower is judged by {taken['lower']:,} of {ticks:,} cycles" in line
 
 
-@pytest.mark.slow
 def test_a_recorder_that_dies_while_writing_the_viewers_file_is_reported(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,7 +162,6 @@ def test_a_recorder_that_dies_while_writing_the_viewers_file_is_reported(
     ]
 
 
-@pytest.mark.slow
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path):
         with pytest.raises(Failure, match="another recorder is still writing it"):
@@ -177,7 +170,6 @@ def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path
             rebuild_files(tmp_path)
 
 
-@pytest.mark.slow
 def test_opening_a_run_waits_for_the_recorder_of_a_killed_launcher(
     config: RackConfig, tmp_path: Path
 ) -> None:

@@ -10,8 +10,8 @@ import pytest
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Message, field
 from rack.boards.config.layout import build_field_specs
-from rack.tools.console.answer import Failure
 from rack.tools.recording.signal import Signal, Trigger
+from tests.tools.command_line import read_failure
 
 
 class Gait(IntEnum):
@@ -99,10 +99,7 @@ UNKNOWN = {
 
 @pytest.mark.parametrize(("name", "why"), UNKNOWN.items())
 def test_an_unknown_name_is_reported_in_one_line(name: str, why: str) -> None:
-    with pytest.raises(Failure) as failure:
-        Signal.parse(name, [BOX])
-    assert str(failure.value).startswith(f"{name}: {why}")
-    assert failure.value.status == 2
+    assert read_failure(Signal.parse, name, [BOX]).startswith(f"{name}: {why}")
 
 
 @pytest.mark.parametrize(
@@ -136,6 +133,4 @@ UNFIT = {
 
 @pytest.mark.parametrize(("text", "why"), UNFIT.items())
 def test_an_invalid_condition_is_reported_in_one_line(text: str, why: str) -> None:
-    with pytest.raises(Failure) as failure:
-        Trigger.parse(text, [BOX])
-    assert (str(failure.value), failure.value.status) == (why.format(text), 2)
+    assert read_failure(Trigger.parse, text, [BOX]) == why.format(text)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
-import pytest
-
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import find_core
 from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.recording.cycles import measure_budgets, read_cycles
@@ -19,7 +16,8 @@ from rack.tools.report.report import build_report
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.tables import build_document
 from tests.tools.analysis_text import text
-from tests.tools.recordings import MS, Cycle, recorded
+from tests.tools.conftest import Record
+from tests.tools.recordings import MS, Cycle, Traces
 
 MISSED, PLANNED = int(Flag.MISSED), int(Flag.PLANNED)
 TICK_MS = 2.5
@@ -29,12 +27,6 @@ FIRST = find_core(0)
 """The clock's core."""
 OTHER = FIRST + 1
 """The core of the lower level and of its planner, whatever cores this machine has."""
-
-
-@pytest.fixture
-def config(small: Path) -> RackConfig:
-    """Two levels in real time: the upper every 20 ms, the lower every 2.5 ms."""
-    return load(small, ["clock.mode=realtime", "clock.priority=90"])
 
 
 def skipping(count: int) -> int:
@@ -53,11 +45,7 @@ def late_clock(tick: int, since: int, late_ms: float) -> dict[str, Any]:
 
 
 def run(
-    folder: Path,
-    config: RackConfig,
-    traces: dict[str, list[Cycle]],
-    *events: dict[str, Any],
-    priority: int = 80,
+    record: Record, traces: Traces, *events: dict[str, Any], priority: int = 80, settings: str = ""
 ) -> Recording:
     """Return a recording whose lower level had a core of its own."""
     lost = {"missed": 0, "skipped": 0}
@@ -66,22 +54,16 @@ def run(
         name: lost | {"core": OTHER, "priority": priority} for name in ("lower", "lower.planner")
     }
     outcome = {"kind": "outcome", "outcome": {}, "tasks": places}
-    return recorded(folder, config, traces, [*events, outcome])
+    return record(traces, "clock.priority=90", *settings.split(), events=[*events, outcome])
 
 
 def find_stalls(recording: Recording) -> Stalls:
     return analyze_stalls(recording)[0]
 
 
-def test_skipped_cycles_are_attributed_to_steal_of_their_core(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    skipped = Cycle(20, PLAIN, flags=skipping(5))
-    recording = run(
-        tmp_path / "run",
-        config,
-        {"lower": [*plain_cycles(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]},
-    )
+def test_skipped_cycles_are_attributed_to_steal_of_their_core(record: Record) -> None:
+    skipped = [Cycle(20, PLAIN, flags=skipping(5)), Cycle(30, PLAIN, flags=skipping(2))]
+    recording = run(record, {"lower": [*plain_cycles(8, 15), *skipped]})
     # Releases 15 to 19 were skipped. The next record begins at tick 20.
     for first, last, during in ((14.0, 14.8, 0), (15.2, 16.0, 5), (19.2, 19.8, 5), (20.2, 20.9, 0)):
         span = Stolen(int(first * TICK_MS * MS), int(last * TICK_MS * MS), OTHER, 10)
@@ -95,88 +77,64 @@ def test_skipped_cycles_are_attributed_to_steal_of_their_core(
 
 def absence_trace() -> dict[str, list[Cycle]]:
     """Return traces in which the other core was away from tick 50 until 1 ms after tick 52."""
-    return {
-        "lower": [
-            *plain_cycles(SETTLED, 50),
-            Cycle(52, PLAIN, late=1.0, flags=skipping(2)),
-            *plain_cycles(53, 60),
-        ]
-    }
+    late = Cycle(52, PLAIN, late=1.0, flags=skipping(2))
+    return {"lower": [*plain_cycles(SETTLED, 50), late, *plain_cycles(53, 60)]}
 
 
-def test_an_absence_of_a_core_without_steal_is_reported(config: RackConfig, tmp_path: Path) -> None:
-    recording = run(tmp_path / "run", config, absence_trace())
-    assert find_stalls(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
+def test_an_absence_of_a_core_without_steal_is_reported(record: Record) -> None:
+    recording = run(record, absence_trace())
+    absence = Absence(OTHER, times=1, longest_ms=6.0, lost=2)
+    assert find_stalls(recording).absences == [absence]
     report = build_report(recording)
-    assert report["stalls"]["absences"] == [
-        {"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}
-    ]
-    line = (
-        f"- core {OTHER} was away although no steal was counted (stalls: 1, longest 6 ms); 2 of 2 "
-    )
-    assert line in format_markdown(report)
+    assert report["stalls"]["absences"] == [asdict(absence)]
+    unstolen = "although no steal was counted (stalls: 1, longest 6 ms)"
+    assert f"- core {OTHER} was away {unstolen}; 2 of 2 " in format_markdown(report)
 
 
-def test_a_core_that_ran_another_task_was_not_absent(config: RackConfig, tmp_path: Path) -> None:
+def test_a_core_that_ran_another_task_was_not_absent(record: Record) -> None:
     # The planner ends its plan, at a higher priority, 0.2 ms before the executor gets the core.
     plan = Cycle(48, (0.0, 0.1, 10.6, 0.1), flags=PLANNED)
-    assert not find_stalls(
-        run(tmp_path / "run", config, absence_trace() | {"lower.planner": [plan]})
-    ).absences
+    recording = run(record, absence_trace() | {"lower.planner": [plan]})
+    assert not find_stalls(recording).absences
 
 
-def test_a_task_without_real_time_priority_shows_no_absence(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_a_task_without_real_time_priority_shows_no_absence(record: Record) -> None:
     # The launch obtained no real-time priority.
     long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
     late = late_clock(52, since=50, late_ms=5.9)
-    refused = run(tmp_path / "refused", config, absence_trace() | long, late, priority=0)
+    refused = run(record, absence_trace() | long, late, priority=0)
     assert not find_stalls(refused).absences
     assert [cycles.stalled_count for cycles in read_cycles(refused).values()] == [0, 0]
 
 
-def test_counted_steal_is_not_reported_as_an_absence_again(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    recording = run(tmp_path / "run", config, absence_trace())
+def test_counted_steal_is_not_reported_as_an_absence_again(record: Record) -> None:
+    recording = run(record, absence_trace())
     recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, OTHER, 10),))
     assert (find_stalls(recording).during_steal, find_stalls(recording).absences) == (2, [])
 
 
-def test_cycles_lost_to_a_late_clock_are_attributed_to_the_clocks_core(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    recording = run(
-        tmp_path / "run", config, absence_trace(), late_clock(52, since=50, late_ms=5.9)
-    )
+def test_cycles_lost_to_a_late_clock_are_attributed_to_the_clocks_core(record: Record) -> None:
+    recording = run(record, absence_trace(), late_clock(52, since=50, late_ms=5.9))
     assert find_stalls(recording).absences == [Absence(FIRST, times=1, longest_ms=5.9, lost=2)]
 
 
-def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
+def test_lockstep_has_no_stalls(record: Record) -> None:
     long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
-    recording = run(tmp_path / "run", load(small), absence_trace() | long)
+    recording = run(record, absence_trace() | long, settings="clock.mode=lockstep")
     assert find_stalls(recording) == Stalls(2, 0, [])
     assert [cycles.stalled_count for cycles in read_cycles(recording).values()] == [0, 0]
 
 
-def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_path: Path) -> None:
-    long = Cycle(50, (0.0, 0.1, 6.3, 0.1))
-    trace = {
-        "lower": [
-            *plain_cycles(SETTLED, 50),
-            long,
-            Cycle(53, PLAIN, flags=skipping(2)),
-            *plain_cycles(54, 60),
-        ]
-    }
-    computed = run(tmp_path / "computed", config, trace)
+def test_stalled_cycles_do_not_count_towards_a_budget(record: Record) -> None:
+    long = [Cycle(50, (0.0, 0.1, 6.3, 0.1)), Cycle(53, PLAIN, flags=skipping(2))]
+    trace = {"lower": [*plain_cycles(SETTLED, 50), *long, *plain_cycles(54, 60)]}
+    computed = run(record, trace)
     assert measure_budgets(computed)["lower"].process_ns == round(6.3 * MS)
     assert read_cycles(computed)["lower"].stalled_count == 0
-    stolen = run(tmp_path / "stolen", config, trace)
+    stolen = run(record, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
     # The clock board was away at that time, so the whole machine may have been.
-    away = run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))
+    away = run(record, trace, late_clock(52, since=51, late_ms=3.0))
     for recording in (stolen, away):
         assert measure_budgets(recording)["lower"].process_ns == MS
         analysis = Analysis.from_recording(recording)

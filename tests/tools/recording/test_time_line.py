@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.console.answer import Failure
 from rack.tools.recording.time_line import RackAlignment, align_racks
+from tests.tools.command_line import read_failure
 from tests.tools.machines import CLOCK_NS, ERROR_NS, MS, TICKS, A, B, C, Machine, S, recorded
 
 
@@ -59,12 +61,8 @@ def test_racks_that_never_met_the_first_one_are_refused(tmp_path: Path) -> None:
 def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     later = recorded(replace(B, begins_ns=B.begins_ns + 60 * S), [], tmp_path / "b")
-    with pytest.raises(
-        Failure, match=r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
-    ) as refused:
-        align_racks([one, later])
-    assert refused.value.status == 2
-    assert "\n" not in str(refused.value)
+    why = r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
+    assert re.search(why, read_failure(align_racks, [one, later]))
 
 
 def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import pytest
 
 from rack.boards.config import load
+from rack.boards.config.toml import to_toml
 from rack.tools.launch.continued import RepeatedRun, load_branch_config
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.recording.checksums import format_checked_line, parse_checked_line
+from rack.tools.recording.checksums import format_checked_line
 from rack.tools.recording.recording import Recording
 from rack.tools.report.against import compare_runs
 from rack.tools.report.report import OtherRun
@@ -24,34 +25,17 @@ from tests.tools.command_line import rack, read_refusal
 
 pytestmark = pytest.mark.slow
 SECONDS = 0.5
-WAVES = f"""{REMEMBERING}
-[board.second]
-slot = 4
-rate_hz = 400
-executor = "wave_levels:Wave"
-
-[board.third]
-slot = 5
-rate_hz = 400
-executor = "wave_levels:Wave"
-"""
+OTHERS = {
+    name: {"slot": slot, "rate_hz": 400, "executor": "wave_levels:Wave"}
+    for name, slot in (("second", 4), ("third", 5))
+}
+WAVES = REMEMBERING + to_toml({"board": OTHERS})
 FAULTS = """
-[[fault]]
-kind = "kill"
-board = "wave"
-tick = 130
-
-[[fault]]
-kind = "corrupt"
-board = "second"
-tick = 130
-cycles = 4
-
-[[fault]]
-kind = "delay"
-board = "third"
-tick = 130
-cycles = 4
+fault = [
+    { kind = "kill", board = "wave", tick = 130 },
+    { kind = "corrupt", board = "second", tick = 130, cycles = 4 },
+    { kind = "delay", board = "third", tick = 130, cycles = 4 },
+]
 """
 OWN_LEVEL = """
 from time import monotonic_ns
@@ -81,26 +65,6 @@ class Passing(Executor):
 
     def process(self, tick):
         self.sum.value[:] = self.below.message.value
-"""
-SUMMING = """
-format = 2
-name = "summing"
-python_path = ["{folder}"]
-
-[clock]
-period_ms = 2.5
-mode = "lockstep"
-
-[board.adding]
-slot = 2
-rate_hz = 400
-executor = "{module}:Summing"
-
-[board.passing]
-slot = 3
-rate_hz = 50
-below = "adding"
-executor = "{module}:Passing"
 """
 Run = Callable[..., Recording]
 
@@ -151,17 +115,6 @@ def explain_difference(
 ) -> dict[str, Any]:
     """Return the explanation in the report of two runs."""
     return compare_runs(one, OtherRun(other.folder, of, repeats))
-
-
-def _losing(run: Recording) -> Path:
-    """Return a copy of a recorded run whose recorder lost rows."""
-    folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
-    events = folder / "events.jsonl"
-    lines = [parse_checked_line(line) for line in events.read_text().splitlines()]
-    for line in lines:
-        line |= {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else {}
-    events.write_text("".join(map(format_checked_line, lines)))
-    return folder
 
 
 @pytest.mark.thorough
@@ -233,7 +186,11 @@ def test_a_fault_is_the_cause_and_nothing_is_repeated(
 @pytest.mark.thorough
 def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> None:
     level = tmp_path / "summing_levels.py"
-    text = SUMMING.format(folder=tmp_path, module=level.stem)
+    adding = {"slot": 2, "rate_hz": 400, "executor": f"{level.stem}:Summing"}
+    passing = {"slot": 3, "rate_hz": 50, "below": "adding", "executor": f"{level.stem}:Passing"}
+    head = {"format": 2, "name": "summing", "python_path": [str(tmp_path)]}
+    clock = {"period_ms": 2.5, "mode": "lockstep"}
+    text = to_toml({**head, "clock": clock, "board": {"adding": adding, "passing": passing}})
     level.write_text(OWN_LEVEL.replace("AFTER", "self._sum"))
     one = ran("one", text)
     level.write_text(OWN_LEVEL.replace("AFTER", "self._sum + 1.0"))
@@ -268,6 +225,10 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     runs: Runs, tmp_path: Path
 ) -> None:
     one, two = runs.one, runs.changed
+    # A copy of a run whose recorder lost rows.
+    losing = Path(shutil.copytree(two.folder, tmp_path / "losing"))
+    outcome = {**two.end_counts, "rows_lost": {"wave": 3}}
+    (losing / "events.jsonl").write_text(format_checked_line(outcome))
     done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
     assert "  - not repeated: --repeat runs both racks again, up to that cycle" in done.stdout
@@ -276,7 +237,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     for arguments, said in (
         ((*against, runs.commanded.folder), "are of different racks: only the first has 'wave'"),
         ((*against, tmp_path), "not a run"),
-        ((*against, _losing(two)), "lost 3 rows; the two runs cannot be compared"),
+        ((*against, losing), "lost 3 rows; the two runs cannot be compared"),
         ((*against, two.folder, "--of", "wave.statu"), "nearest: wave.status"),
         ((one.folder, "--of", "wave.status"), "need --against"),
     ):

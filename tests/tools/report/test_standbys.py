@@ -3,7 +3,6 @@ continues it, before and after its hand-overs, to the same digest."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from rack.tools.report.summary import format_run_summary
 from rack.tools.viewer.reading import read_component
 from tests.shared_runs import CLOCK_LOST_AT, LOWER_LOST_AT, standby_run
-from tests.tools.command_line import rack
+from tests.tools.command_line import read_answer
 
 pytestmark = pytest.mark.slow
 LOST = "the active copy was lost"
@@ -23,7 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_report_tells_the_active_copies(run: Path) -> None:
-    report = json.loads(rack("report", run, "--json").stdout)
+    report = read_answer("report", run)
     assert [
         (each["task"], each["active"], each["since_tick"], each["why"], each["hand_overs"])
         for each in report["standbys"]
@@ -65,12 +64,9 @@ def test_the_viewer_has_a_lane_of_active_copies(
 def test_a_run_continues_a_run_with_hand_overs_to_its_digest(
     run: Path, tmp_path: Path, tick: int
 ) -> None:
-    known = json.loads(rack("report", run, "--json").stdout)
+    known = read_answer("report", run)
     at_s = tick * known["clock_ms"] * 1e-3
-    done = rack(
-        *("run", "--from", f"{run}@{at_s:g}", "--seconds", known["simulated_s"]),
-        *("--out", tmp_path / "again", "--json"),
-    )
-    again = json.loads(done.stdout)
+    words = ("--seconds", known["simulated_s"], "--out", tmp_path / "again")
+    again = read_answer("run", "--from", f"{run}@{at_s:g}", *words)
     assert (again["digest"], again["failures"]) == (known["digest"], [])
     assert again["standbys"] == known["standbys"]

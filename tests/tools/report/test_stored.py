@@ -15,7 +15,7 @@ from rack.tools.report import stored
 from rack.tools.report.report import OtherRun, write_report
 from rack.tools.report.stored import RECORDED_FILES, read_stored_report
 from tests.shared_runs import small_run
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_answer
 
 
 @pytest.fixture
@@ -31,10 +31,6 @@ def make_newer(path: Path) -> None:
     os.utime(path, ns=(later_ns, later_ns))
 
 
-def rename(path: Path) -> None:
-    path.rename(path.with_name("elsewhere"))
-
-
 def cut_off(path: Path) -> None:
     path.write_text('{"rack": ')
     path.with_suffix(".md").touch()
@@ -42,20 +38,17 @@ def cut_off(path: Path) -> None:
 
 CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "newer": (make_newer, tuple(RECORDED_FILES)),
-    "missing": (rename, ("report.json", "report.md", *RECORDED_FILES)),
+    "missing": (
+        lambda path: path.rename(path.with_name("elsewhere")),
+        ("report.json", "report.md", *RECORDED_FILES),
+    ),
     "there": (Path.touch, (stored.SPOOL,)),
     "damaged": (cut_off, ("report.json",)),
 }
+CASES = [(change, name) for change, names in CHANGES.values() for name in names]
 
 
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        pytest.param(change, name, id=f"{name} {what}")
-        for what, (change, names) in CHANGES.items()
-        for name in names
-    ],
-)
+@pytest.mark.parametrize(("change", "name"), CASES)
 def test_a_stored_report_is_shown_until_a_file_changes(
     folder: Path, change: Callable[[Path], object], name: str
 ) -> None:
@@ -90,8 +83,8 @@ def test_the_command_rebuilds_a_report_only_when_necessary(folder: Path) -> None
     report = json.loads((folder / "report.json").read_text())
     (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
     Checksums(folder).store("report.*")
-    assert json.loads(rack("report", folder, "--json").stdout)["digest"] == "as stored"
+    assert read_answer("report", folder)["digest"] == "as stored"
     assert "Digest `as stored`." in rack("report", folder, "--full").stdout
     make_newer(folder / "events.jsonl")
-    assert json.loads(rack("report", folder, "--json").stdout) == report
+    assert read_answer("report", folder) == report
     assert json.loads((folder / "report.json").read_text()) == report

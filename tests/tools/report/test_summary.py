@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from rack.boards.config import load
-from rack.tools.launch.launch import run_rack
 from rack.tools.launch.verdict import UNRECORDED
-from rack.tools.monitor.display import Display
 from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.report.report import build_report, write_report
 from rack.tools.report.summary import MAX_LINES, WIDTH, format_run_summary, show_summary
-from tests.shared_runs import faulty_run, nasrem_run, small_run
+from tests.shared_runs import faulty_run, nasrem_run, run_text
 from tests.tools.command_line import rack
+from tests.tools.conftest import Record
 from tests.tools.recording.test_stalls import (
     MISSED,
     OTHER,
@@ -28,8 +25,10 @@ from tests.tools.recording.test_stalls import (
     SETTLED,
     absence_trace,
     plain_cycles,
-    run,
     skipping,
+)
+from tests.tools.recording.test_stalls import (
+    run as run_stalled,
 )
 from tests.tools.recordings import MS, Cycle
 
@@ -53,15 +52,12 @@ def flat(lines: list[str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def small_report(tmp_path_factory: pytest.TempPathFactory) -> Document:
-    return write_report(small_run(tmp_path_factory))[0]
+def small_report(run: Path) -> Document:
+    return write_report(run)[0]
 
 
 def armless_run(factory: pytest.TempPathFactory) -> Path:
-    path = factory.mktemp("armless") / "run"
-    config = load("fig2", [f"name=test-armless-{os.getpid()}", "clock.mode=lockstep"])
-    run_rack(config, 0.5, path, Display())
-    return path
+    return run_text(factory, 'format = 2\nextends = ["fig2"]\n', 0.5, "clock.mode=lockstep")
 
 
 RUNS: dict[Callable[[pytest.TempPathFactory], Path], tuple[str, tuple[str, ...]]] = {
@@ -172,12 +168,9 @@ CAUSES: dict[str, tuple[dict[str, list[Cycle]], tuple[Stolen, ...], list[Any], s
 
 
 @pytest.mark.parametrize("case", CAUSES)
-def test_each_lost_cycle_has_the_cause_that_the_recording_shows(
-    case: str, small: Path, tmp_path: Path
-) -> None:
+def test_each_lost_cycle_has_the_cause_that_the_recording_shows(case: str, record: Record) -> None:
     traces, stolen, causes, line = CAUSES[case]
-    config = load(small, ["clock.mode=realtime", "clock.priority=90"])
-    recording = run(tmp_path / "run", config, traces)
+    recording = run_stalled(record, traces)
     recording.cores = CoreRecord(100 * MS, stolen)
     report = build_report(recording) | {"bytes": 0}
     found = [(miss["why"], miss["why_ms"]) for miss in report["misses"]]

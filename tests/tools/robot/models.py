@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rack.tools.robot.draft import ArmOptions, Draft, draft_arm
+from rack.tools.robot.source import read_source
+
 LENGTHS = (0.1, 0.3, 0.3, 0.1, 0.08, 0.06)  # m
 AXES = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 {half}"/><mass value="{mass}"/>
@@ -71,3 +74,8 @@ def written(folder: Path, text: str, name: str = "small.urdf") -> Path:
     path = folder / name
     path.write_text(text)
     return path
+
+
+def drafted(folder: Path, model: Path) -> Draft:
+    """Draft the config of a model into a folder, without options."""
+    return draft_arm(read_source(model), ArmOptions(), folder, "drafted")

@@ -8,10 +8,9 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.tools.robot.arm import ArmParts, find_arm
-from rack.tools.robot.draft import ArmOptions, draft_arm
 from rack.tools.robot.source import read_source
 from tests.tools.command_line import ROOT
-from tests.tools.robot.models import joint, link, urdf, written
+from tests.tools.robot.models import drafted, joint, link, urdf, written
 
 DESK_ARM = (ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml").read_text()
 JOINTS = ("waist", "shoulder", "elbow", "roll", "pitch", "twist")
@@ -110,9 +109,7 @@ def test_an_arm_with_too_many_joints_is_refused_with_advice(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) -> None:
     text = with_tool("flange", rod("flex1") + rod("loose", spring=""))
-    made = draft_arm(
-        read_source(written(tmp_path, text, "a.xml")), ArmOptions(), tmp_path, "drafted"
-    )
+    made = drafted(tmp_path, written(tmp_path, text, "a.xml"))
     model = made.build_cell().model
     names = [model.joint(k).name for k in range(model.njnt)]
     assert set(names) == {*JOINTS, "flex1"}
@@ -155,8 +152,7 @@ def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
     tmp_path: Path, limits: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    source = read_source(written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
-    made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
+    made = drafted(tmp_path, written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
     assert "joints without limits: j1, j2, j3; [robot] position can state them" in made.notes
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
@@ -166,7 +162,7 @@ def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
 @pytest.mark.parametrize("effort", ["inf", "1e12"])
 def test_torques_are_guessed_instead_of_an_infinite_effort(tmp_path: Path, effort: str) -> None:
     text = urdf(gripper=False).replace('effort="60.0"', f'effort="{effort}"')
-    made = draft_arm(read_source(written(tmp_path, text)), ArmOptions(), tmp_path, "drafted")
+    made = drafted(tmp_path, written(tmp_path, text))
     assert "torque" in made.guessed
     assert made.robot.torque is not None
     assert max(made.robot.torque) < 1e3

@@ -13,10 +13,9 @@ from rack.levels.errors import Refused
 from rack.levels.robot.dynamics import Dynamics
 from rack.tools.robot import assignment
 from rack.tools.robot.assignment import Assignment
-from rack.tools.robot.draft import EMPTY_SCENE, ArmOptions, draft_arm
+from rack.tools.robot.draft import EMPTY_SCENE
 from rack.tools.robot.folder import format_config
-from rack.tools.robot.source import read_source
-from tests.tools.robot.models import urdf, written
+from tests.tools.robot.models import drafted, urdf, written
 
 pytestmark = pytest.mark.slow
 
@@ -31,8 +30,7 @@ def with_friction(text: str) -> str:
 
 
 def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Path) -> None:
-    source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
-    made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
+    made = drafted(tmp_path, written(tmp_path, with_friction(urdf(gripper=False))))
     assert "dry friction acts within 1 ms" in made.notes
     cell = made.build_cell()
     dynamics = Dynamics(cell)
@@ -52,7 +50,7 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
     friction: float, bandwidth: float | None, tmp_path: Path
 ) -> None:
     model = with_friction(urdf(gripper=False)).replace(str(DRY_N_M), str(friction))
-    made = draft_arm(read_source(written(tmp_path, model)), ArmOptions(), tmp_path, "drafted")
+    made = drafted(tmp_path, written(tmp_path, model))
     assert made.limits.bandwidth == bandwidth
     text = format_config(made, Assignment(EMPTY_SCENE, [], "nothing"), "drafted", made.model)
     servo = {"servo": {"params": {"bandwidth": bandwidth}}}
@@ -60,7 +58,7 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
 
 
 def test_a_rehearsal_ends_with_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = draft_arm(read_source(written(tmp_path, urdf())), ArmOptions(), tmp_path, "drafted")
+    made = drafted(tmp_path, written(tmp_path, urdf()))
     home = [{"do": "home"}]
     assignment._rehearse_program(made, EMPTY_SCENE, home)
     monkeypatch.setattr(assignment, "REHEARSAL_S", 0.0)

@@ -8,17 +8,12 @@ import pytest
 
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import FollowConfig, GripperConfig
-from rack.tools.robot.draft import CLOCK_NS, EMPTY_SCENE, ArmOptions, Draft, draft_arm
-from rack.tools.robot.source import read_source
+from rack.tools.robot.draft import CLOCK_NS, EMPTY_SCENE, Draft
 from tests.levels.robot import grippers
-from tests.tools.robot.models import urdf, written
+from tests.tools.robot.models import drafted, urdf, written
 
 pytestmark = pytest.mark.slow
 MOTOR = '<position name="grip_right" joint="finger_right" {}/>'
-
-
-def drafted(folder: Path, model: Path) -> Draft:
-    return draft_arm(read_source(model), ArmOptions(), folder, "drafted")
 
 
 def gripper_of(made: Draft) -> GripperConfig:

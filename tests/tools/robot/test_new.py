@@ -19,6 +19,7 @@ from tests.tools.robot.models import LIMIT, joint, link, urdf, written
 DESK_ARM = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
 EXAMPLE = DESK_ARM.with_suffix(".toml")
 TAIL = "</robot>"
+BLOCKS = "a table, two blocks to move"
 TURNS = LIMIT.format(low=-1, high=1, effort=9)
 LEVER = link("lever", "0.01 0.01 0.01", "0 0 0")
 LEVER += joint("aside", "base", "lever", "0 0.2 0", "0 0 1", limit=TURNS)
@@ -44,29 +45,22 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which `rack robot new` made "small" of a URDF."""
-    folder = tmp_path_factory.mktemp("new")
-    made = read_answer("robot", "new", written(folder, urdf()), folder=folder)
-    assert made["task"] == "a table, two blocks to move"
-    return folder
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("has_jaw", [False, True], ids=["two fingers", "a finger and a jaw"])
 def test_a_urdf_transfers_two_blocks_with_nothing_edited(tmp_path: Path, has_jaw: bool) -> None:
     model = written(tmp_path, urdf(jaw=has_jaw), "hand.urdf")
     made = read_answer("robot", "new", model, folder=tmp_path)
-    assert made["task"] == "a table, two blocks to move", made["notes"]
+    assert made["task"] == BLOCKS, made["notes"]
     words = ("--lockstep", "--out", tmp_path / "run", "--set", "name=hand-of-test")
     report = read_answer("run", "hand", *words, folder=tmp_path)
     assert max(row["off_mm"] for row in report["objects"]) < 5.0
 
 
 @pytest.mark.slow
-def test_values_of_the_urdf_are_used_and_the_others_named_as_guesses(small: Path) -> None:
-    text = (small / "small" / "small.toml").read_text()
+def test_values_of_the_urdf_are_used_and_the_others_named_as_guesses(tmp_path: Path) -> None:
+    model = written(tmp_path, urdf())
+    assert read_answer("robot", "new", model, folder=tmp_path)["task"] == BLOCKS
+    text = (tmp_path / "small" / "small.toml").read_text()
     robot = tomllib.loads(text)["robot"]
     assert robot["joints"] == ["j1", "j2", "j3", "j4", "j5", "j6"]
     assert robot["torque"] == [60.0] * 6
@@ -78,7 +72,7 @@ def test_values_of_the_urdf_are_used_and_the_others_named_as_guesses(small: Path
     assert "velocity = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]\n" in text
     assert "\nhome = " in text
     assert "# guessed: free of contact" in text
-    refusal = read_refusal(rack("robot", "new", small / "small.urdf", folder=small))
+    refusal = read_refusal(rack("robot", "new", model, folder=tmp_path))
     assert "'small' exists already" in refusal
 
 

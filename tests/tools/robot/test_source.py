@@ -76,6 +76,8 @@ def test_elements_and_attributes_with_a_prefix_are_ignored(tmp_path: Path, extra
     assert len(read(tmp_path, text).spec.joints) == 6
 
 
+MESH = '<geometry><mesh filename="{}"/></geometry>'
+BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 STRUCTURE = {
     "world": (
         '<joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint>',
@@ -122,19 +124,13 @@ def test_links_without_inertia_are_named(tmp_path: Path) -> None:
 
 def test_unreadable_visuals_are_noted_or_refused(tmp_path: Path) -> None:
     (tmp_path / "l.dae").touch()
-    mesh = '<geometry><mesh filename="l.dae"/></geometry>'
-    box = "<geometry><box"
-    some = with_visuals(range(6, 7))
-    head, _, tail = some.rpartition(box)
-    text = head + mesh + tail[tail.index("</geometry>") + len("</geometry>") :]
+    mesh = MESH.format("l.dae")
+    head, _, tail = with_visuals(range(6, 7)).rpartition("<geometry><box")
+    text = head + mesh + tail.partition("</geometry>")[2]
     why = "no <collision> and no mesh that can be read, so no shape in planning: l6"
     assert read(tmp_path, text).notes == [why]
     nothing = re.sub("<geometry>.*?</geometry>", mesh, MODEL.replace("collision>", "visual>"))
     assert "as Collada and the like are not read" in refusal(tmp_path, nothing)
-
-
-MESH = '<geometry><mesh filename="{}"/></geometry>'
-BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 
 
 def test_a_missing_mesh_is_reported_with_all_searched_places(tmp_path: Path) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import date
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
 from rack.tools.scripting.launched import list_settings
 from tests.boards.commanded_racks import COMMANDED
-from tests.processes import BOUND_S
+from tests.processes import BOUND_S, run_to_end
 
 LOCKSTEP = {"clock.mode": "lockstep"}
 
@@ -160,22 +160,15 @@ def test_a_rack_stays_until_its_recorder_has_begun(
 def test_a_rack_that_is_not_launched_leaves_no_folder(
     commanded: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[RecorderProcess] = []
-    start: Callable[[RecorderProcess], None] = RecorderProcess._start
-
-    def note(recorder: RecorderProcess) -> None:
-        started.append(recorder)
-        start(recorder)
-
-    monkeypatch.setattr(RecorderProcess, "_start", note)
+    start = Mock(side_effect=RecorderProcess._start, autospec=True)
+    monkeypatch.setattr(RecorderProcess, "_start", lambda recorder: start(recorder))
     settings = {**LOCKSTEP, "name": rack_name, "board.lower.executor": "rack.levels.none:None"}
-    with (
-        pytest.raises(rack.ConfigError),
-        rack.Rack(commanded, settings=settings, out=tmp_path / "run"),
-    ):
+    own = rack.Rack(commanded, settings=settings, out=tmp_path / "run")
+    with pytest.raises(rack.ConfigError), own:
         pass
     assert not (tmp_path / "run").exists()
-    (recorder,) = started
+    ((recorder,), _) = start.call_args
+    start.assert_called_once()
     assert recorder._process.poll() is not None
 
 
@@ -184,9 +177,8 @@ def test_a_recording_that_cannot_be_written_is_a_failure(
     commanded: Path, tmp_path: Path, rack_name: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    own = rack.Rack(
-        commanded, settings={**LOCKSTEP, "name": rack_name}, out=tmp_path / "file" / "run"
-    )
+    settings, out = {**LOCKSTEP, "name": rack_name}, tmp_path / "file" / "run"
+    own = rack.Rack(commanded, settings=settings, out=out)
     with pytest.raises(rack.Failure, match=r"run: Not a directory$"), own:
         pass
 
@@ -196,5 +188,4 @@ def test_a_prompt_completes_the_public_names_alone() -> None:
     assert dir(rack) == names
     code = "import json, rack; rack.Rack; print(json.dumps(dir(rack)))"
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=BOUND_S)
-    assert json.loads(done.stdout) == names
+    assert json.loads(run_to_end(command, BOUND_S, check=True).stdout) == names

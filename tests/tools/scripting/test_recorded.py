@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +12,16 @@ import pytest
 import rack
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.events import Event
-from rack.tools.recording.checksums import format_checked_line
 from rack.tools.recording.recording import Recording
 from tests.processes import BOUND_S
-from tests.shared_runs import SMALL_S, nasrem_run, small_run
+from tests.shared_runs import SMALL_S
+from tests.tools.recordings import add_events
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_run(tmp_path_factory)
-
-
-def test_a_signal_is_an_array_with_its_ticks_and_unit(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    run = rack.open_run(nasrem_run(tmp_path_factory))
+def test_a_signal_is_an_array_with_its_ticks_and_unit(nasrem: Recording) -> None:
+    run = rack.open_run(nasrem.folder)
     position = run.signals["servo.status.position"]
     assert (position.unit, position.values.shape) == ("rad", (2600, 6))
     assert position.ticks.tolist() == list(range(2600))
@@ -46,68 +37,64 @@ def test_a_signal_is_an_array_with_its_ticks_and_unit(
     assert len(levels) == len(run.signals["task.status.state"].ticks)
 
 
-def test_a_run_at_a_time_has_the_messages_that_tasks_read_then(small: Path) -> None:
-    moment = rack.open_run(small).at(1.2)
+def test_a_run_at_a_time_has_the_messages_that_tasks_read_then(run: Path) -> None:
+    moment = rack.open_run(run).at(1.2)
     assert (moment.tick, moment.time_s) == (480, 1.2)
-    status = rack.open_run(small).signals["lower.status.count"]
+    status = rack.open_run(run).signals["lower.status.count"]
     # Written in the tick before, visible now.
     assert moment["lower.status.count"] == moment.read("lower.status").count
     assert moment["lower.status.count"] == status.values[status.ticks == 479]
     assert moment["upper.status.state"] == "idle"
     assert {"lower.status", "upper.command", "lower.plan"} <= set(moment.mailboxes)
     with pytest.raises(rack.Failure, match=r"no message yet at 0 s"):
-        rack.open_run(small).at(0).read("lower.status")
+        rack.open_run(run).at(0).read("lower.status")
     with pytest.raises(rack.Failure, match=r"^4\.1: must be 0 to 3\.9975 s$"):
-        rack.open_run(small).at(4.1)
+        rack.open_run(run).at(4.1)
 
 
-def test_a_run_is_resumed_from_a_time_in_the_background(small: Path) -> None:
-    expected = Recording(small).end_counts["outcome"]
-    with rack.open_run(small).at(1.2025).resume(seconds=SMALL_S) as resumed:
+def test_a_run_is_resumed_from_a_time_in_the_background(run: Path) -> None:
+    expected = Recording(run).end_counts["outcome"]
+    with rack.open_run(run).at(1.2025).resume(seconds=SMALL_S) as resumed:
         outcome = resumed.wait(BOUND_S)
     assert outcome is not None
     assert (outcome.digest, outcome.ticks) == (expected["digest"], expected["ticks"])
     with pytest.raises(rack.Failure, match=r"board\.upper\.more = 1: unknown key"):
-        rack.open_run(small).at(1.2025).resume("board.upper.more=1")
+        rack.open_run(run).at(1.2025).resume("board.upper.more=1")
 
 
-def test_events_and_report_are_those_of_the_run(small: Path) -> None:
-    run = rack.open_run(small)
-    assert [event.kind for event in run.events if event.kind in ("start", "end")] == [
-        "start",
-        "end",
-    ]
-    assert run.report["simulated_s"] == 4.0
-    assert (small / "report.json").is_file()
+def test_events_and_report_are_those_of_the_run(run: Path) -> None:
+    opened = rack.open_run(run)
+    ends = [event.kind for event in opened.events if event.kind in ("start", "end")]
+    assert ends == ["start", "end"]
+    assert opened.report["simulated_s"] == 4.0
+    assert (run / "report.json").is_file()
 
 
-def test_runs_and_signals_describe_themselves(small: Path) -> None:
-    run = rack.open_run(small)
-    name = run._recording.layout.rack
-    ends = f"time over, {len(run.signals)} signals>"
-    assert repr(run) == f"<run {small} of rack '{name}': {ends}"
-    count = run.signals["lower.status.count"]
-    assert repr(run.signals).startswith(f"<{len(run.signals)} signals of ")
-    assert repr(run.at(1.2)) == f"<run {small} at 1.2 s, tick 480>"
+def test_runs_and_signals_describe_themselves(run: Path) -> None:
+    opened = rack.open_run(run)
+    name = opened._recording.layout.rack
+    ends = f"time over, {len(opened.signals)} signals>"
+    assert repr(opened) == f"<run {run} of rack '{name}': {ends}"
+    count = opened.signals["lower.status.count"]
+    assert repr(opened.signals).startswith(f"<{len(opened.signals)} signals of ")
+    assert repr(opened.at(1.2)) == f"<run {run} at 1.2 s, tick 480>"
     spec = count.signal.spec
     assert (count.meaning, count.unit) == (spec.meaning, "")
     assert repr(count) == f"<signal lower.status.count: {spec.meaning}>"
 
 
-def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
+def test_a_plot_has_units_names_and_marks(run: Path, tmp_path: Path) -> None:
     from matplotlib import pyplot
 
     folder = tmp_path / "run"
-    shutil.copytree(small, folder)
-    with (folder / "events.jsonl").open("a") as events:
-        for tick, kind, code, text in (
-            (400, "fault", "begins", "wave begins"),
-            (800, "fault", "begins", "kill begins"),
-            (800, "died", "died", "board 'lower' ended"),
-            (900, "fault", "ends", "wave ends"),
-        ):
-            event = Event(0, tick, kind, "lower", text, code)  # type: ignore[arg-type]
-            events.write(format_checked_line(asdict(event)))
+    shutil.copytree(run, folder)
+    add_events(
+        folder,
+        (400, "fault", "begins", "wave begins"),
+        (800, "fault", "begins", "kill begins"),
+        (800, "died", "died", "board 'lower' ended"),
+        (900, "fault", "ends", "wave ends"),
+    )
     signals = rack.open_run(folder).signals
     axes = signals["lower.status.count"].plot()
     (count,) = axes.get_lines()
@@ -130,24 +117,24 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
         signals["lower.status.reason"].plot()
 
 
-def test_a_plot_of_an_array_has_a_curve_a_number(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_plot_of_an_array_has_a_curve_a_number(nasrem: Recording) -> None:
     from matplotlib import pyplot
 
-    axes = rack.open_run(nasrem_run(tmp_path_factory)).signals["servo.status.position"].plot()
+    axes = rack.open_run(nasrem.folder).signals["servo.status.position"].plot()
     assert [line.get_label() for line in axes.get_lines()] == [f"[{joint}]" for joint in range(6)]
     assert axes.get_ylabel() == "servo.status.position, rad"
     pyplot.close("all")
 
 
 def test_without_a_package_one_line_says_what_to_install(
-    small: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for package in ("pandas", "matplotlib"):
         monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(rack.Failure, match=r"^tables need pandas: pip install 'nasrem-rack\["):
-        rack.open_run(small).to_pandas("lower.status")
+        rack.open_run(run).to_pandas("lower.status")
     with pytest.raises(rack.Failure, match=r"^no pictures: they need matplotlib: pip install 'n"):
-        rack.open_run(small).signals["lower.status.count"].plot()
+        rack.open_run(run).signals["lower.status.count"].plot()
 
 
 def test_a_rack_of_a_program_is_recorded(commanded: Path, tmp_path: Path, rack_name: str) -> None:

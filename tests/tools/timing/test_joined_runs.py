@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config.joined import join_racks
+from rack.boards.config.toml import to_toml
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.joined_runs import format_joined_runs, measure_joined_runs
@@ -24,107 +26,64 @@ pytestmark = pytest.mark.slow
 MOST_S = 200.0
 NAME = "test-three"
 RACKS = ("top", "middle", "bottom")
-LAN = """
-[adapter.lan]
-slot = 6
-rate_hz = 100
-"""
-IMPORT = """
-[adapter.lan.import.order]
-from = "{rack}/relay.command"
-type = "order_levels:Order"
-rate_hz = 50
-max_age_ms = 1000
-delay_ms = 20
-"""
-EXPORT = """
-[adapter.lan.export.order]
-from = "relay.command"
-rate_hz = 50
-"""
+IMPORT = {"type": "order_levels:Order", "rate_hz": 50, "max_age_ms": 1000, "delay_ms": 20}
+EXPORT = {"order": {"from": "relay.command", "rate_hz": 50}}
+
+
+def board(slot: int, rate_hz: int, level: str, **keys: object) -> dict[str, object]:
+    """Return the table of a board."""
+    return {"slot": slot, "rate_hz": rate_hz, "executor": f"order_levels:{level}", **keys}
+
+
+FROM_LAN = {"reads": {"above": "lan.order"}}
 BOARDS = {
-    "top": """
-[board.source]
-slot = 2
-rate_hz = 25
-below = "relay"
-executor = "order_levels:Source"
-
-[board.relay]
-slot = 3
-rate_hz = 50
-above = "source"
-executor = "order_levels:Relay"
-""",
-    "middle": """
-[board.relay]
-slot = 2
-rate_hz = 50
-executor = "order_levels:Relay"
-reads = { above = "lan.order" }
-""",
-    "bottom": """
-[board.relay]
-slot = 2
-rate_hz = 100
-below = "sink"
-executor = "order_levels:Relay"
-reads = { above = "lan.order" }
-
-[board.sink]
-slot = 3
-rate_hz = 50
-above = "relay"
-executor = "order_levels:Sink"
-""",
+    "top": {
+        "source": board(2, 25, "Source", below="relay"),
+        "relay": board(3, 50, "Relay", above="source"),
+    },
+    "middle": {"relay": board(2, 50, "Relay", **FROM_LAN)},
+    "bottom": {
+        "relay": board(2, 100, "Relay", below="sink", **FROM_LAN),
+        "sink": board(3, 50, "Sink", above="relay"),
+    },
 }
-FAULTS = {
-    "middle": """
-[[fault]]
-kind = "delay"
-board = "relay"
-mailbox = "relay.command"
-by = 8
-at = 0.5
-for = 0.4
-""",
-    "bottom": """
-[[fault]]
-kind = "mute"
-board = "lan"
-mailbox = "lan.order"
-at = 1.5
-for = 0.2
-""",
-}
+Faults = dict[str, list[dict[str, object]]]
 
 
-def write_configs(folder: Path, faults: dict[str, str]) -> dict[str, Path]:
+DELAY = {"kind": "delay", "board": "relay", "mailbox": "relay.command", "by": 8, "at": 0.5}
+MUTE = {"kind": "mute", "board": "lan", "mailbox": "lan.order", "at": 1.5}
+FAULTS: Faults = {"middle": [{**DELAY, "for": 0.4}], "bottom": [{**MUTE, "for": 0.2}]}
+
+
+def write_configs(folder: Path, faults: Faults) -> dict[str, Path]:
     """Write the configs of three racks, the first of which launches the others.
 
     With faults, the source has another rate, so that orders are not those of a run without faults.
     """
     paths = {}
     for number, rack_ in enumerate(RACKS):
-        others = [f"unix/{NAME}-{one}" for one in RACKS[:number]]
-        lan = f'{LAN}listen = ["unix/{NAME}-{rack_}"]\nconnect = {json.dumps(others)}\n'
-        # In lockstep, racks that exchange messages wait for each other.
-        lan += (
-            f"peers = {json.dumps([f'{NAME}-{one}' for one in RACKS[number + 1 : number + 2]])}\n"
-        )
-        if number == 0:
-            lan += 'launch = ["middle.toml", "bottom.toml"]\n'
-        head = f'format = 2\nname = "{NAME}-{rack_}"\npython_path = ["{Path(__file__).parent}"]\n'
-        head += "\n[clock]\nperiod_ms = 2.5\n"
-        tables = [IMPORT.format(rack=f"{NAME}-{RACKS[number - 1]}")] if number else []
-        tables += [EXPORT] if number < 2 else []
+        lan: dict[str, object] = {
+            "slot": 6,
+            "rate_hz": 100,
+            "listen": [f"unix/{NAME}-{rack_}"],
+            "connect": [f"unix/{NAME}-{one}" for one in RACKS[:number]],
+            # In lockstep, racks that exchange messages wait for each other.
+            "peers": [f"{NAME}-{one}" for one in RACKS[number + 1 : number + 2]],
+            "launch": [f"{one}.toml" for one in RACKS[1:]] if number == 0 else [],
+            "export": EXPORT if number < 2 else {},
+        }
+        if number > 0:
+            source = f"{NAME}-{RACKS[number - 1]}/relay.command"
+            lan["import"] = {"order": {"from": source, **IMPORT}}
+        head = {"format": 2, "name": f"{NAME}-{rack_}", "python_path": [str(Path(__file__).parent)]}
+        tables = {"clock": {"period_ms": 2.5}, "board": BOARDS[rack_], "adapter": {"lan": lan}}
         paths[rack_] = folder / f"{rack_}.toml"
-        text = "".join((head, BOARDS[rack_], lan, *tables, faults.get(rack_, "")))
+        text = to_toml({**head, **tables, "fault": faults.get(rack_, [])})
         paths[rack_].write_text(text.replace("= 25", "= 50") if faults else text)
     return paths
 
 
-def run_racks(folder: Path, faults: dict[str, str], seconds: str) -> dict[str, Path]:
+def run_racks(folder: Path, faults: Faults, seconds: str) -> dict[str, Path]:
     """Run the three racks in lockstep, and return their recordings."""
     configs = write_configs(folder, faults)
     command = [*RACK, "run", configs["top"], "--lockstep", "--seconds", seconds, "--share"]
@@ -194,23 +153,17 @@ def test_a_response_beyond_its_bound_names_the_rack_and_the_cause(
     assert "FAILS: command: at most" in lines[1]
 
 
-def remove_budget(run: Path, folder: Path) -> Path:
-    """Return a copy of a run whose links have no delay budget."""
-    shutil.copytree(run, folder)
-    config = folder / "config.toml"
-    lines = config.read_text().splitlines(keepends=True)
-    config.write_text("".join(line for line in lines if not line.startswith("delay_ms")))
-    Checksums(folder).store("config.toml")
-    return folder
-
-
 def test_recordings_that_do_not_belong_together_are_refused(
     runs: dict[str, Path],
     faulty_runs: dict[str, Path],
     tmp_path: Path,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    unbudgeted = remove_budget(runs["middle"], tmp_path / "unbudgeted")
+    # A copy of a run whose links have no delay budget.
+    unbudgeted = Path(shutil.copytree(runs["middle"], tmp_path / "unbudgeted"))
+    config = unbudgeted / "config.toml"
+    config.write_text(re.sub("(?m)^delay_ms.*\n", "", config.read_text()))
+    Checksums(unbudgeted).store("config.toml")
     cases: dict[str, tuple[Sequence[Path], str]] = {
         "another cell": (
             [runs["top"], small_run(tmp_path_factory)],

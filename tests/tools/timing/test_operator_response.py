@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load
 from rack.tools.console.tables import render_text
-from rack.tools.lab.benches.observed import record_rack
+from rack.tools.recording.recording import Recording
 from rack.tools.timing.operator_response import OperatorResponse, measure_response, plot_response
 from tests.boards.commanded_racks import COMMANDED, commands
+from tests.shared_runs import run_text
 
 pytestmark = pytest.mark.slow
 
 
-def run_and_measure(name: str, folder: Path, *given: tuple[str, str, int]) -> OperatorResponse:
+def run_and_measure(
+    factory: pytest.TempPathFactory, *given: tuple[str, str, int]
+) -> OperatorResponse:
     """Run a rack with commands: level, what and tick of each."""
-    path = folder / "told.toml"
-    path.write_text(COMMANDED)
     tables = [
         f"level='{level}', what='{what}', {'home=true, ' * (what == 'goto')}tick={tick}"
         for level, what, tick in given
     ]
-    config = load(path, [f"name={name}", commands(*tables)])
-    response = measure_response(record_rack(config, 1.0, folder / "run").recording)
+    run = run_text(factory, COMMANDED, 1.0, commands(*tables))
+    response = measure_response(Recording(run))
     assert response is not None
     return response
 
@@ -35,8 +34,7 @@ def run_and_measure(name: str, folder: Path, *given: tuple[str, str, int]) -> Op
 def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
     """Return the response of a run with three commands that all take effect."""
     given = ("upper", "hold", 101), ("upper", "resume", 176), ("lower", "hold", 250)
-    folder = tmp_path_factory.mktemp("responses")
-    return run_and_measure(f"test-response-{os.getpid()}", folder, *given)
+    return run_and_measure(tmp_path_factory, *given)
 
 
 def test_every_command_of_a_run_comes_at_its_predicted_tick(
@@ -54,10 +52,11 @@ def test_every_command_of_a_run_comes_at_its_predicted_tick(
     assert all(picture.stat().st_size > 1000 for picture in pictures)
 
 
-def test_commands_without_effect_have_distinct_fates(rack_name: str, tmp_path: Path) -> None:
+def test_commands_without_effect_have_distinct_fates(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     response = run_and_measure(
-        rack_name,
-        tmp_path,
+        tmp_path_factory,
         ("upper", "goto", 50),
         ("upper", "hold", 101),
         # This command overtakes the previous one on its way down.

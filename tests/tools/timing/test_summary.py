@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from dataclasses import replace
@@ -16,7 +15,7 @@ from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.verdicts import INBOX, evaluate_rack
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.summary import find_tightest
-from tests.tools.command_line import rack
+from tests.tools.command_line import rack, read_answer
 
 BUDGET = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }"
 UPPER = "board.upper.budget={ process_ms = 0.1 }"
@@ -77,8 +76,8 @@ def test_each_printed_fix_makes_the_rack_fit_when_it_is_pasted(words: tuple[str,
     for fix in fixes:
         done = rack("check", *words, *shlex.split(fix))
         assert (done.returncode, done.stdout[:4]) == (0, "fits"), fix
-    stored = json.loads(rack("check", *words, "--json").stdout)["timing"]["repair"]["fixes"]
-    assert [shlex.split(fix)[1::2] for fix in fixes] == stored
+    timing = read_answer("check", *words, status=1)["timing"]
+    assert [shlex.split(fix)[1::2] for fix in fixes] == timing["repair"]["fixes"]
 
 
 def test_the_verdict_names_everything_that_was_not_counted(small: Path) -> None:
@@ -107,13 +106,12 @@ def test_the_document_names_everything_that_was_not_counted(small: Path) -> None
         ((idle, UPPER), None, ["clock", "lower.planner"]),
     ):
         words = [word for setting in settings for word in ("--set", setting)]
-        printed = check_lines(small, *words, *ALONE, "--json", status=int(fits is False))
-        timing = json.loads("\n".join(printed))["timing"]
+        timing = read_answer("check", small, *words, *ALONE, status=int(fits is False))["timing"]
         assert (timing["fits"], list(timing["uncounted"])) == (fits, names)
 
 
 def test_host_boards_are_named_as_not_counted() -> None:
-    found = json.loads(rack("check", "ibm", "--json").stdout)["timing"]["uncounted"]
+    found = read_answer("check", "ibm")["timing"]["uncounted"]
     hosts = load("ibm").host
     assert hosts
     assert hosts.keys() <= found.keys()

@@ -5,22 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 
-from rack.backplane.segment import Launch
 from rack.boards.config import build_rack_timing, load, resolve_layout
+from rack.boards.config.cell import build_rack_cell
 from rack.boards.events import Event
 from rack.levels.messages import ServoStatus
-from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.tools.viewer.blueprint import CYCLES, MAX_LANES, RackViews
 from rack.tools.viewer.cell import MarkWriter, write_geometry
 from rack.tools.viewer.levels import COLUMN, ROW, compute_positions, name_lanes
 from rack.tools.viewer.reading import read_component
-from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, open_recording
+from rack.tools.viewer.stream import Moment
 from rack.tools.viewer.style import LOST
+from tests.tools.viewer.streams import build_rows, open_stream
 
 Part = rrb.Container | rrb.View
 COLOUR = {
@@ -54,8 +53,7 @@ def has_legend(view: rrb.TimeSeriesView) -> bool:
 def plots(name: str | Path, first: bool) -> list[rrb.TimeSeriesView]:
     """Return the plots of a rack."""
     config = load(name)
-    robot = config.robot
-    cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
+    cell = None if config.robot is None else build_rack_cell(config)
     found = views(RackViews(resolve_layout(config), config, cell).build_all_views(), first)
     return [view for view in found if isinstance(view, rrb.TimeSeriesView)]
 
@@ -161,26 +159,17 @@ def test_the_graph_has_ranks_in_rows_and_other_boards_to_their_left(
 def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Path) -> None:
     config = load("nasrem")
     assert config.robot is not None
-    cell = build_cell(config.robot, config.scene, config.clock_ns)
-    times = Timelines(config.clock_ns, Launch(0, 0))
-    recording = open_recording("run", "run", tmp_path / "run.rrd", rrb.Blueprint(rrb.TextLogView()))
-    stream = Stream(recording, times)
-    arm = write_geometry(stream, cell)
-    marks = MarkWriter(stream, cell, config.robot.joints, ["servo"], arm)
-    dtype = [
-        ("tick", "i8"),
-        ("stamp_ns", "i8"),
-        ("message", ServoStatus.message_type.build_dtype(compute_sizes(cell))),
-    ]
-    rows = np.zeros(9, dtype=dtype)
-    rows["tick"] = np.arange(9)
+    cell = build_rack_cell(config)
+    rows = build_rows(ServoStatus, cell, 9)
     rows["message"]["braked"][3:6] = 1
-    marks.write(RowBlock(rows, times))
-    for tick, code in ((2, "begins"), (7, "ends")):
-        text = f"sensor-nan (j3) {code}, and more"
-        event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")
-        marks.mark_event(Moment(tick, 0), event)
-    stream.close()
+    with open_stream(tmp_path / "run.rrd", config.clock_ns) as opened:
+        arm = write_geometry(opened.stream, cell)
+        marks = MarkWriter(opened.stream, cell, config.robot.joints, ["servo"], arm)
+        marks.write(opened.block(rows))
+        for tick, code in ((2, "begins"), (7, "ends")):
+            text = f"sensor-nan (j3) {code}, and more"
+            event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")
+            marks.mark_event(Moment(tick, 0), event)
     assert len(arm) > len(config.robot.joints)
     for part in arm:
         entity, red = "/" + "/".join(part.entity), int(LOST)

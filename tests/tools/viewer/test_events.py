@@ -7,15 +7,13 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-import rerun.blueprint as rrb
-
-from rack.backplane.segment import Launch
 from rack.boards.config import load, resolve_layout
 from rack.boards.events import Event, EventKind
 from rack.tools.recording.checksums import format_checked_line
 from rack.tools.viewer.events import EventWriter
 from rack.tools.viewer.reading import read_component
-from rack.tools.viewer.stream import Stream, Timelines, open_recording
+from rack.tools.viewer.stream import Moment
+from tests.tools.viewer.streams import open_stream
 
 
 def write_log(
@@ -26,24 +24,18 @@ def write_log(
     Returns:
         The lines in the viewer's order, and each loss as its tick and the task.
     """
-    config = load("fig2")
-    layout = resolve_layout(config)
-    times = Timelines(layout.clock_ns, Launch(time.time_ns(), 0))
-    stream = Stream(open_recording("events", "run", folder / "run.rrd", rrb.Blueprint()), times)
-    (folder / "events.jsonl").write_text("".join(format_checked_line(asdict(e)) for e in events))
+    layout, path = resolve_layout(load("fig2")), folder / "events.jsonl"
+    path.write_text("".join(format_checked_line(asdict(event)) for event in events))
     lost: list[tuple[int, str]] = []
-    writer = EventWriter(
-        stream,
-        folder / "events.jsonl",
-        layout,
-        {"servo": "1-servo"},
-        lambda when, task: lost.append((when.tick, task)),
-        None,
-    )
-    for tick in blocks:
-        writer.write_events(tick)
-    stream.flush()
-    stream.close()
+
+    def add_loss(when: Moment, task: str) -> None:
+        lost.append((when.tick, task))
+
+    with open_stream(folder / "run.rrd", layout.clock_ns, time.time_ns()) as opened:
+        lanes = {"servo": "1-servo"}
+        writer = EventWriter(opened.stream, path, layout, lanes, add_loss, None)
+        for tick in blocks:
+            writer.write_events(tick)
     log = read_component(folder / "run.rrd", "/log/events", "TextLog:text")
     return [str(line) for line in log.values.ravel()], lost
 

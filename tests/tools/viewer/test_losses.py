@@ -2,48 +2,35 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.boards.config import load
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.viewer.reading import EntityRows, read_component
 from rack.tools.viewer.style import LOST
+from tests.shared_runs import run_text
+
+pytestmark = pytest.mark.slow
 
 LOST_AT = (200, 600)
 """Ticks at which the servo board is killed and hangs."""
 STATE = "StateChange:state"
-FAULTS = """
-[[fault]]
-kind = "kill"
-board = "servo"
-at = 0.5
-
-[[fault]]
-kind = "hang"
-board = "servo"
-at = 1.5
-
-[[fault]]
-kind = "kill"
-board = "world"
-at = 0.5
+LOSSES = """
+format = 2
+extends = ["nasrem"]
+fault = [
+    { kind = "kill", board = "servo", at = 0.5 },
+    { kind = "hang", board = "servo", at = 1.5 },
+    { kind = "kill", board = "world", at = 0.5 },
+]
 """
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("losses")
-    faults = folder / "faults.toml"
-    faults.write_text(FAULTS)
-    config = load("nasrem", [f"name=test-losses-{os.getpid()}", "clock.mode=lockstep"], faults)
-    run_rack(config, 2.8, folder / "run", Display())
-    return folder / "run" / "run.rrd"
+    return run_text(tmp_path_factory, LOSSES, 2.8, "clock.mode=lockstep") / "run.rrd"
 
 
 def list_spans(rows: EntityRows, states: Iterable[str]) -> list[tuple[int, int]]:
@@ -58,7 +45,6 @@ def list_spans(rows: EntityRows, states: Iterable[str]) -> list[tuple[int, int]]
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_dead_and_a_hanging_board_are_lost_until_they_return(file: Path) -> None:
     events = read_component(file, "/log/events", "TextLog:text").values.ravel().tolist()
     returns = [int(line.split()[1].rstrip(":")) for line in events if "'servo' rejoined" in line]
@@ -72,7 +58,6 @@ def test_a_dead_and_a_hanging_board_are_lost_until_they_return(file: Path) -> No
     assert world[0] == LOST_AT[0]
 
 
-@pytest.mark.slow
 def test_the_arm_is_red_while_its_board_is_silent(file: Path) -> None:
     rows = read_component(file, "/cell/link3/forearm", "Capsules3D:colors")
     silence = read_component(file, "/levels/4-servo/state", STATE)
@@ -83,7 +68,6 @@ def test_the_arm_is_red_while_its_board_is_silent(file: Path) -> None:
     assert rows.values.ravel()[-1] != LOST
 
 
-@pytest.mark.slow
 def test_every_line_of_the_log_begins_with_its_tick(file: Path) -> None:
     for source in ("events", "levels"):
         try:

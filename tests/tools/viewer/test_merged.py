@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
-from rack.boards.config import load
 from rack.tools.launch.continued import RepeatedRun, load_branch_config
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
@@ -23,7 +21,7 @@ from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.sink import RackWriter, RunContext
 from rack.tools.viewer.stream import Stream, Timelines, open_recording
 from tests.boards.remembering_racks import REMEMBERING
-from tests.shared_runs import nasrem_run
+from tests.shared_runs import run_text
 from tests.tools.command_line import rack
 from tests.tools.machines import CLOCK_NS, MS, TICKS, A, B, S, recorded
 
@@ -44,15 +42,12 @@ def read_contents(file: Path) -> dict[tuple[str, str], Any]:
     return {key: sorted(rows) for key, rows in found.items()}
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return Recording(nasrem_run(tmp_path_factory))
-
-
 @pytest.mark.slow
-def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_path: Path) -> None:
-    write_merged(align_racks([run]), tmp_path / "again.rrd", lambda part: None)
-    again, live = read_contents(tmp_path / "again.rrd"), read_contents(run.folder / "run.rrd")
+def test_a_view_built_from_files_equals_the_recorders_view(
+    nasrem: Recording, tmp_path: Path
+) -> None:
+    write_merged(align_racks([nasrem]), tmp_path / "again.rrd", lambda part: None)
+    again, live = read_contents(tmp_path / "again.rrd"), read_contents(nasrem.folder / "run.rrd")
     assert again.keys() == live.keys()
     for key, rows in live.items():
         # Limits are written once per block, and the blocks differ.
@@ -63,18 +58,18 @@ def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_p
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [1, -1])
 def test_the_goal_of_a_move_does_not_depend_on_how_the_recorder_reads_rings(
-    run: Recording, tmp_path: Path, step: int
+    nasrem: Recording, tmp_path: Path, step: int
 ) -> None:
-    names = sorted((*run.mailboxes, *run.cycles))[::step]
-    rows = {name: run.read_rows(name) for name in names}
-    context = RunContext.from_config(run.layout, run.config, run.folder)
+    names = sorted((*nasrem.mailboxes, *nasrem.cycles))[::step]
+    rows = {name: nasrem.read_rows(name) for name in names}
+    context = RunContext.from_config(nasrem.layout, nasrem.config, nasrem.folder)
     recording = open_recording("run", "run", tmp_path / "one.rrd", rrb.Blueprint())
-    grid = align_racks([run])[0].grid
+    grid = align_racks([nasrem])[0].grid
     stream = Stream(recording, Timelines(grid.clock_ns, grid.launch))
     RackWriter(stream, context).write(rows, grid.ticks[1] + 1, {})
     recording.disconnect()
     goals = ("/cell/current_goal", "Points3D:labels")
-    one, live = read_contents(tmp_path / "one.rrd"), read_contents(run.folder / "run.rrd")
+    one, live = read_contents(tmp_path / "one.rrd"), read_contents(nasrem.folder / "run.rrd")
     assert one[goals] == live[goals]
     assert one[goals][-1][1] == "['move']"
 
@@ -121,34 +116,27 @@ def test_the_uncertainty_of_times_is_in_the_log(merged_file: Path) -> None:
 
 @pytest.fixture(scope="module")
 def branched_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of two runs: "whole", and "other", which branches off at tick 150; and of the
-    file in which both are, "both.rrd"."""
-    folder = tmp_path_factory.mktemp("branched")
-    file = folder / "remembering.toml"
-    file.write_text(REMEMBERING)
-    config = load(file, [f"name=test-branched-{os.getpid()}"])
-    run_rack(config, 0.75, folder / "whole", Display())
-    whole = Recording(folder / "whole")
+    """The folder of two runs: "run", and "other", which branches off at tick 150; and of the file
+    in which both are, "both.rrd"."""
+    run = run_text(tmp_path_factory, REMEMBERING, 0.75)
+    folder, whole = run.parent, Recording(run)
     config = load_branch_config(whole, ["board.wave.params.factor=2"], None)
     with RepeatedRun(whole) as again:
         run_rack(config, 0.75, folder / "other", Display(), beginning=again.continue_at(150))
-    names = ("other", "--against", "whole", "--out", "both.rrd")
+    names = ("other", "--against", "run", "--out", "both.rrd")
     done = rack("replay", *names, folder=folder)
     assert done.returncode == 0, done.stderr
     return folder
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     branched_runs: Path,
 ) -> None:
     merged_file = branched_runs / "both.rrd"
-    curves = [
-        read_component(merged_file, f"/{run}/signals/wave.status/value")
-        for run in ("whole", "other")
-    ]
-    for rows, run in zip(curves, ("whole", "other"), strict=True):
+    names = ("run", "other")
+    curves = [read_component(merged_file, f"/{run}/signals/wave.status/value") for run in names]
+    for rows, run in zip(curves, names, strict=True):
         own = Recording(branched_runs / run)
         assert rows.ticks.tolist() == own.read_signal("wave.status", "tick").tolist()
         assert rows.values.ravel().tolist() == own.read_signal("wave.status", "value").tolist()
@@ -156,12 +144,11 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     marks = read_component(merged_file, "/log/time\\ line", "TextLog:text")
     assert list(zip(marks.ticks.tolist(), marks.values.ravel().tolist(), strict=True)) == [
         (150, "tick 150: other branches off"),
-        (150, "tick 150: other differs from whole: wave.status"),
+        (150, "tick 150: other differs from run: wave.status"),
     ]
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize("view", [None, "log of all runs"])
 def test_no_view_of_a_branch_and_its_run_fails_in_the_viewer(
     branched_runs: Path, view: str | None

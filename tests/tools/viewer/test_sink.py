@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from rack.tools.viewer import sink
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import find_executable
+from tests.processes import BOUND_S, run_to_end
 
 TICKS = 600
 """1.5 s: the rings hold two."""
@@ -39,12 +39,8 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
             assert [part.exists() for part in parts] == [end > place * PART for place in range(4)]
             # A part is complete as soon as the next one has begun.
             if end > PART and end % PART == BLOCK:
-                subprocess.run(
-                    [find_executable(), "rrd", "verify", parts[end // PART - 1]],
-                    check=True,
-                    capture_output=True,
-                    timeout=60,
-                )
+                part = parts[end // PART - 1]
+                run_to_end([find_executable(), "rrd", "verify", part], BOUND_S, check=True)
         view.close(TICKS, {})
     whole, *later = [
         read_component(part, "/signals/lower.status/count").ticks for part in parts[:3]

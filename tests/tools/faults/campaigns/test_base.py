@@ -22,6 +22,8 @@ from rack.tools.faults.campaigns.results import judge_trial
 from rack.tools.faults.campaigns.trial import Start, Trial, run_trial
 from tests.conftest import EXHAUSTIVE
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 5.0
 STRIKES = 330
 MOVES = 1130
@@ -46,12 +48,11 @@ class Bench:
         self.base = BaseRack(self._config, name)
         self.crate = crate
 
-    def run(self, plan: Plan, whole: bool = False, seconds: float = SECONDS) -> Trial:
+    def run(self, plan: Plan, whole: bool = False) -> Trial:
         """Run a plan."""
         start = Start(whole="as asked") if whole else self.base.find_start(plan, self.crate)
-        return run_trial(
-            self._config, plan, self.base.name, 0, seconds, start=start, crate=self.crate
-        )
+        name = self.base.name
+        return run_trial(self._config, plan, name, 0, SECONDS, start=start, crate=self.crate)
 
 
 def verdict(trial: Trial) -> dict[str, Any]:
@@ -116,7 +117,6 @@ def bench(small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.Mon
     return Bench(load(small), rack_name, crate)
 
 
-@pytest.mark.slow
 def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
     bench: Bench,
 ) -> None:
@@ -140,7 +140,6 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
     later = ((520, "upper.command"), (700, "lower.status"), (1000, "upper.command"))
     faults = tuple(
@@ -171,7 +170,6 @@ def test_a_fault_begins_once_the_one_before_is_settled(bench: Bench) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_the_faultless_rack_runs_only_as_far_as_necessary_and_equals_one_without_snapshots(
     bench: Bench,
 ) -> None:
@@ -188,7 +186,6 @@ def test_the_faultless_rack_runs_only_as_far_as_necessary_and_equals_one_without
     assert [event.kind for event in rest.events].count("end") == 1
 
 
-@pytest.mark.slow
 def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
     plan = Plan(1, "kills", True, (), (Kill("lower", 600, 0.5),))
     found = bench.run(plan)
@@ -196,7 +193,6 @@ def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
     assert [strike.board for strike in found.strikes] == ["lower"]
 
 
-@pytest.mark.slow
 def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> None:
     soon = Plan(1, "faults", False, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
@@ -204,7 +200,6 @@ def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> 
     assert bench.base.find_start(early, bench.crate).whole == "a fault prevents the launch"
 
 
-@pytest.mark.slow
 def test_a_rack_without_snapshots_runs_whole_trials(
     small: Path, rack_name: str, tmp_path: Path, crate: WarmCrate
 ) -> None:

@@ -82,7 +82,6 @@ def test_missing_messages_are_counted_up_to_the_newest(
     assert count_missing_messages(segment, {"writer"}, ()) == 0
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_the_command_compares_kills_without_and_with_a_standby(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"

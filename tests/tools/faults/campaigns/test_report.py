@@ -71,12 +71,8 @@ def made() -> CampaignReport:
     return report_of(results)
 
 
-@pytest.fixture
-def report(made: CampaignReport) -> dict[str, Any]:
-    return made.to_document()
-
-
-def test_the_figures_summarise_the_right_runs(report: dict[str, Any]) -> None:
+def test_the_figures_summarise_the_right_runs(made: CampaignReport) -> None:
+    report = made.to_document()
     summary = report["summary"]
     ends = ("trials", "tasks_done", "safely_stopped", "neither")
     assert [summary[key] for key in ends] == [3, 1, 1, 1]

@@ -18,27 +18,25 @@ from rack.tools.faults.ending import EXTERNAL
 from rack.tools.faults.judge import Judgement
 from tests.tools.fault_events import TICK_NS
 
-FOUND = Judgement(
-    kind="mute",
-    board="lower",
-    mailbox="",
-    joint="",
-    size=None,
-    began=90,
-    struck=100,
-    seen="detected",
-    is_judged=True,
-    cycle=2,
-)
-
 
 def judgement(kind: str = "mute", delay: int | None = 5, bound: int = 10, **more: Any) -> Judgement:
-    delay_ms = None if delay is None else delay * 2.5
-    found = replace(FOUND, kind=kind, delay=delay, delay_ms=delay_ms, bound=bound)
-    is_within = delay is not None and delay <= bound
-    return replace(
-        replace(found, seen="missed" if delay is None else "detected", is_within=is_within), **more
+    found = Judgement(
+        kind=kind,
+        board="lower",
+        mailbox="",
+        joint="",
+        size=None,
+        began=90,
+        struck=100,
+        seen="missed" if delay is None else "detected",
+        is_judged=True,
+        cycle=2,
+        delay=delay,
+        delay_ms=None if delay is None else delay * 2.5,
+        bound=bound,
+        is_within=delay is not None and delay <= bound,
     )
+    return replace(found, **more)
 
 
 def test_faults_that_did_not_act_count_only_as_drawn() -> None:

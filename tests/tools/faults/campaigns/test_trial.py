@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,50 +22,49 @@ pytestmark = pytest.mark.filterwarnings(FORKS)
 PERIOD_NS = 2_500_000
 
 
-def bus(make: MakeBus, pid: int) -> Segment:
-    """Return the memory of a rack whose board `level` is this process, and whose clock stands at
-    tick 0."""
-    segment = make(task("level"), task("other", slot=3))
-    words, block = segment.words, segment.get_block("level")
-    words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, True, 0
-    words[System.EPOCH_NS] = time.monotonic_ns()
-    block[Block.PID], block[Block.STATE] = pid, TaskState.RUNNING
-    return segment
-
-
-def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) -> None:
+@pytest.fixture
+def board(make_bus: MakeBus) -> Iterator[tuple[int, Segment]]:
+    """The process of a board `level`, and the memory of its rack, whose clock is at tick 0."""
     with forked(lambda: time.sleep(BOUND_S)) as pid:
-        segment = bus(make_bus, pid)
-        killer = Killer(segment, [Kill(board="level", tick=5, phase=0.0)])
-        segment.words[System.TICK] = 4
-        killer.kill_due_board()
-        assert killer.done == []
-        segment.words[System.TICK] = 5
-        before = time.monotonic_ns()
-        killer.kill_due_board()
-        (kill,) = killer.done
-        assert (kill.board, kill.tick) == ("level", 5)
-        assert before <= kill.time_ns <= time.monotonic_ns()
-        killer.kill_due_board()
-        assert killer.done == [kill]
-        assert exit_status(pid) == -9
+        segment = make_bus(task("level"), task("other", slot=3))
+        words, block = segment.words, segment.get_block("level")
+        words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, True, 0
+        words[System.EPOCH_NS] = time.monotonic_ns()
+        block[Block.PID], block[Block.STATE] = pid, TaskState.RUNNING
+        yield pid, segment
+
+
+def test_a_board_is_killed_once_at_its_tick_and_not_before(board: tuple[int, Segment]) -> None:
+    pid, segment = board
+    killer = Killer(segment, [Kill(board="level", tick=5, phase=0.0)])
+    segment.words[System.TICK] = 4
+    killer.kill_due_board()
+    assert killer.done == []
+    segment.words[System.TICK] = 5
+    before = time.monotonic_ns()
+    killer.kill_due_board()
+    (kill,) = killer.done
+    assert (kill.board, kill.tick) == ("level", 5)
+    assert before <= kill.time_ns <= time.monotonic_ns()
+    killer.kill_due_board()
+    assert killer.done == [kill]
+    assert exit_status(pid) == -9
 
 
 @pytest.mark.parametrize("word", ["STATE", "LOST"])
 def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
-    make_bus: MakeBus, word: str
+    board: tuple[int, Segment], word: str
 ) -> None:
-    with forked(lambda: time.sleep(BOUND_S)) as pid:
-        segment = bus(make_bus, pid)
-        block, place = segment.get_block("level"), getattr(Block, word)
-        sound, block[place] = block[place], TaskState.STARTING if word == "STATE" else 1
-        killer = Killer(segment, [Kill(board="level", tick=0, phase=0.0)])
-        killer.kill_due_board()
-        assert killer.done == []
-        assert os.waitpid(pid, os.WNOHANG) == (0, 0)
-        block[place] = sound
-        wait_until(lambda: killer.kill_due_board() or killer.done)
-        assert exit_status(pid) == -9
+    pid, segment = board
+    block, place = segment.get_block("level"), getattr(Block, word)
+    sound, block[place] = block[place], TaskState.STARTING if word == "STATE" else 1
+    killer = Killer(segment, [Kill(board="level", tick=0, phase=0.0)])
+    killer.kill_due_board()
+    assert killer.done == []
+    assert os.waitpid(pid, os.WNOHANG) == (0, 0)
+    block[place] = sound
+    wait_until(lambda: killer.kill_due_board() or killer.done)
+    assert exit_status(pid) == -9
 
 
 @pytest.mark.slow

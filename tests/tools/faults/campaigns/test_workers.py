@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.process import is_alive
-from rack.boards.config import RackConfig, load
+from rack.boards.config import RackConfig
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT, list_descendants
 from rack.tools.faults.campaigns.plan import Plan
@@ -21,11 +21,6 @@ from tests.processes import FORKS, forked, wait_until
 pytestmark = pytest.mark.slow
 SECONDS = 0.2
 BOUND_S = 30.0
-
-
-@pytest.fixture
-def config(small: Path) -> RackConfig:
-    return load(small)
 
 
 def job(folder: Path, number: int, **more: object) -> TrialJob:

@@ -18,7 +18,7 @@ from rack.tools.lab.benches.apart import run_in_board_environment
 from rack.tools.lab.benches.cycle import PARTS, PHYSICS, compute_costs, compute_parts
 from rack.tools.lab.benches.physics import replay_physics
 from rack.tools.recording.cycles import Cycles
-from tests.shared_runs import nasrem_run
+from rack.tools.recording.recording import Recording
 
 pytestmark = pytest.mark.thorough
 
@@ -66,19 +66,15 @@ def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics
         assert found.find_sample("servo, lockstep", PHYSICS) is not None
 
 
-@pytest.mark.slow
-def test_replayed_physics_end_in_the_recorded_state(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    times_us = run_in_board_environment(replay_physics, nasrem_run(tmp_path_factory), WHOLE)
+def test_replayed_physics_end_in_the_recorded_state(nasrem: Recording) -> None:
+    times_us = run_in_board_environment(replay_physics, nasrem.folder, WHOLE)
     assert 1000 < len(times_us) < WHOLE
     assert min(times_us) > 0.0
 
 
-@pytest.mark.slow
-def test_physics_of_another_run_are_refused(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_physics_of_another_run_are_refused(nasrem: Recording) -> None:
     with pytest.raises(Failure, match="do not end in the recorded state"):
-        run_in_board_environment(replay_lighter, nasrem_run(tmp_path_factory), WHOLE)
+        run_in_board_environment(replay_lighter, nasrem.folder, WHOLE)
 
 
 def replay_lighter(run: Path, ticks: int) -> list[float]:

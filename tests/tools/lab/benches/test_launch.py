@@ -41,7 +41,6 @@ def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:
         measure_kills(str(small), 1)
 
 
-@pytest.mark.slow
 @pytest.mark.alone
 def test_a_kill_is_detected_and_the_brakes_engage() -> None:
     detected, braked = measure_kills("nasrem", 2)

@@ -16,21 +16,16 @@ from rack.tools.lab.benches.apart import run_in_board_environment
 from rack.tools.lab.benches.harness import Sample
 from rack.tools.lab.benches.lockstep import WITHOUT_RACK, build_comparison, run_bare
 from rack.tools.recording.recording import Recording
-from tests.shared_runs import nasrem_run
 
 pytestmark = pytest.mark.thorough
 
 
-@pytest.mark.slow
-def test_levels_write_the_same_messages_with_and_without_a_rack(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    recording = Recording(nasrem_run(tmp_path_factory))
-    ticks = recording.end_counts["outcome"]["ticks"]
+def test_levels_write_the_same_messages_with_and_without_a_rack(nasrem: Recording) -> None:
+    ticks = nasrem.end_counts["outcome"]["ticks"]
     newest = run_in_board_environment(read_newest, load("nasrem", ["clock.mode=lockstep"]), ticks)
-    for name in recording.mailboxes:
-        rows = recording.read_rows(name)["message"]
-        (visible,) = np.nonzero(recording.read_signal(name, "visible_at") < ticks)
+    for name in nasrem.mailboxes:
+        rows = nasrem.read_rows(name)["message"]
+        (visible,) = np.nonzero(nasrem.read_signal(name, "visible_at") < ticks)
         assert newest.get(name) == (rows[visible[-1]] if len(visible) else None), name
 
 

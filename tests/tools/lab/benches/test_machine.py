@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,15 +36,6 @@ SAMPLES = tuple(
     Sample("400 Hz", who, (us,), "us") for who, us in ((WHO, 182.0), (CYCLICTEST, 120.0))
 )
 FOUND = MachineComparison("machine", "", SAMPLES, {}, who=WHO, is_fifo=True, rates=(HELD, MISSED))
-
-
-@pytest.fixture
-def waves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write a config into the only folder on the path."""
-    monkeypatch.setenv("PATH", str(tmp_path))
-    path = tmp_path / "waves.toml"
-    path.write_text(PLAIN)
-    return path
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
@@ -108,10 +100,11 @@ def test_the_verdict_comes_first_with_the_highest_rate_and_the_reason() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
-    waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Callable[[str, str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    waves = write("waves.toml", PLAIN)
+    monkeypatch.setenv("PATH", str(tmp_path))
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
     monkeypatch.setattr("rack.tools.lab.benches.cyclictest.is_fifo_permitted", lambda: True)
     device = tmp_path / "cpu_dma_latency"

@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -28,7 +26,7 @@ from rack.tools.lab.benches.mailbox import (
     build_exchange,
     measure_mailboxes,
 )
-from rack.tools.lab.benches.transports import PEERS, Peer, Transport, open_multiprocessing_pipe
+from rack.tools.lab.benches.transports import PEERS, Peer, open_multiprocessing_pipe
 from tests.processes import BOUND_S
 from tests.tools.lab.benches.test_harness import Hidden
 
@@ -39,7 +37,6 @@ def list_leftovers(pid: int) -> list[str]:
     return [path.name for path in SHM_FOLDER.iterdir() if str(pid) in path.name]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.name)
 def test_every_reader_receives_every_message_and_nothing_is_left(
     peer: Peer, tmp_path: Path
@@ -78,21 +75,12 @@ def exchange_messages(peer: Peer, folder: Path) -> None:
 
 
 def test_a_transport_that_loses_messages_is_noticed() -> None:
-    case = Case("64 B", 2)
-
-    @contextmanager
-    def lossy() -> Iterator[Transport]:
-        with open_multiprocessing_pipe(
-            BenchMessage.message_type.build_dtype(case.lengths), 1
-        ) as transport:
-            stale = BenchMessage.zeros(case.lengths)
-            yield transport._replace(readers=[*transport.readers, lambda tick: stale])
-
-    with (
-        lossy() as transport,
-        pytest.raises(Failure, match=r"^lossy: a reader received another message"),
-    ):
-        build_exchange("lossy", transport, case.lengths)
+    lengths = Case("64 B", 2).lengths
+    stale = BenchMessage.zeros(lengths)
+    with open_multiprocessing_pipe(BenchMessage.message_type.build_dtype(lengths), 1) as transport:
+        lossy = transport._replace(readers=[*transport.readers, lambda tick: stale])
+        with pytest.raises(Failure, match=r"^lossy: a reader received another message"):
+            build_exchange("lossy", lossy, lengths)
 
 
 def test_the_baseline_of_a_case_is_its_best_peer() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import count
 
 import pytest
 
@@ -29,31 +29,16 @@ class Times:
     times: int
 
 
-class Counted:
-    """Experiment that counts its runs."""
-
-    def __init__(self) -> None:
-        self.times = 0
-
-    def make(self, workshop: Workshop) -> Times:
-        self.times += 1
-        return Times(self.times)
-
-    def experiment(self) -> Experiment[Times]:
-        return Experiment("counted", "counting", 1.0, Times, self.make)
-
-
-@pytest.fixture
-def workshop(tmp_path: Path) -> Workshop:
-    found = Workshop(tmp_path / "page", share=True)
-    found.prepare()
-    return found
+def count_runs() -> Experiment[Times]:
+    """Return an experiment that counts its runs."""
+    runs = count(1)
+    return Experiment("counted", "counting", 1.0, Times, lambda workshop: Times(next(runs)))
 
 
 def test_a_result_is_valid_until_the_program_changes(
     workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = Counted().experiment()
+    one = count_runs()
     assert load_result(one, workshop.folder) is None
     first = run_and_store(one, workshop)
     assert load_result(one, workshop.folder) == first
@@ -71,7 +56,7 @@ def test_a_result_is_valid_until_the_program_changes(
 )
 def test_an_experiment_with_an_invalid_result_is_made_again(rest: str, workshop: Workshop) -> None:
     (workshop.folder / RESULTS_FOLDER / "counted.json").write_text(rest)
-    assert load_result(Counted().experiment(), workshop.folder) is None
+    assert load_result(count_runs(), workshop.folder) is None
 
 
 def test_a_missing_requirement_is_stored_as_a_reason_and_a_failure_is_not(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.partition import (
     PARTITION,
     PARTITIONS,
-    PartitionFigures,
     compute_distance,
 )
 from tests.boards.conftest import PLANNED
@@ -43,25 +43,14 @@ def test_a_partition_couples_every_planner_alike_and_uses_all_its_cores() -> Non
     assert found["tight, 2"].board["world"].coupling == "none"
 
 
-def run_partitions(
-    text: str, seconds: float, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> tuple[PartitionFigures, ...]:
-    """Run the rack of a config in all partitions."""
-    (folder / "rack.toml").write_text(text)
-    monkeypatch.setattr(partition, "NAME", str(folder / "rack.toml"))
-    monkeypatch.setattr(partition, "SECONDS", seconds)
-    workshop = Workshop(folder, share=True)
-    workshop.prepare()
-    return PARTITION.measure_if_possible(workshop)
-
-
-@pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 def test_partitions_are_run_and_measured_one_after_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workshop: Workshop, write: Callable[[str, str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = run_partitions(PLANNED, 0.3, tmp_path, monkeypatch)
+    monkeypatch.setattr(partition, "NAME", str(write("rack.toml", PLANNED)))
+    monkeypatch.setattr(partition, "SECONDS", 0.3)
+    found = PARTITION.measure_if_possible(workshop)
     assert tuple(one.partition for one in found) == PARTITIONS
     for one in found:
         cycles = {(task.board, task.role): task.cycles for task in one.tasks}

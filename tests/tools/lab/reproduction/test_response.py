@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,6 @@ from rack.tools.lab.reproduction.experiments.response import (
     run_with_commands,
 )
 from rack.tools.recording.recording import Recording
-from tests.shared_runs import nasrem_run
 
 pytestmark = pytest.mark.thorough
 
@@ -33,21 +31,18 @@ def test_each_command_follows_the_longest_response_to_the_previous_one() -> None
     assert ticks[-1][0] + ticks[-1][1] < MAX_RUN_S / 0.0025
 
 
-@pytest.mark.slow
 def test_the_torque_differs_from_a_run_without_commands_at_the_predicted_tick(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    nasrem: Recording, workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     holds = (("primitive", 2243, 2330), ("elemental_move", 2500, 2760))
     monkeypatch.setattr(response, "HOLDS", holds)
     monkeypatch.setattr(response, "MAX_RUN_S", 6.9)
-    workshop = Workshop(tmp_path, share=True)
-    workshop.prepare()
     found = run_with_commands(workshop, "lockstep")
     assert found.is_within_bounds
     # 2243 is read at 2248, and at 2256; 2500 at 2600, 2704 and 2712.
     predicted = {command.given: command.predicted for command in found.measured_commands}
     assert (predicted[2243], predicted[2500]) == (2256, 2712)
-    folders = tmp_path / RUNS_FOLDER / "response-lockstep", nasrem_run(tmp_path_factory)
+    folders = workshop.folder / RUNS_FOLDER / "response-lockstep", nasrem.folder
     first, second = (Recording(folder).read_signal("servo.status", "torque") for folder in folders)
     length = min(len(first), len(second))
     differing = (first[:length] != second[:length]).any(axis=1)

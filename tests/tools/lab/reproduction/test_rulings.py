@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import CONFIGS
+from rack.boards.config.toml import to_toml
 from rack.tools.lab.reproduction.experiments import (
     figures,
     partition,
@@ -35,63 +36,29 @@ from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
 from tests.tools.lab.reproduction.test_figures import FIGURES
 from tests.tools.lab.reproduction.test_rules import CLAIMS, RULINGS
 
-pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(300)]
 
-LATE = """
-[[fault]]
-kind = "overrun"
-board = "{board}"
-by = 1.2
-at = {at}
-for = "60s"
-"""
+
+def fault(**keys: object) -> str:
+    """Return the table of a fault."""
+    return "\n[[fault]]\n" + to_toml(keys)
+
+
+LONG = {"for": "60s"}
+LATE = {"kind": "overrun", "by": 1.2, **LONG}
 """Every other cycle is skipped."""
-LOCKSTEP = """
-[clock]
-mode = "lockstep"
-"""
+LOCKSTEP = "\n" + to_toml({"clock": {"mode": "lockstep"}})
 SYSTEM_CLAIMS = ("brown", "chimera", "condor", "hic", "ibm", "penn", "rccl")
 WHOLE_TASK_S = 60.0
-LATE_BOARD = LATE.format(board="board2", at=0.1)
-DELAYED = """
-[[fault]]
-kind = "delay"
-board = "{board}"
-by = {by}
-at = 0.5
-for = "60s"
-"""
+LATE_BOARD = fault(board="board2", at=0.1, **LATE)
+DELAYED = {"kind": "delay", "at": 0.5, **LONG}
 SLOW_BUS = "[board.servo.transfer]\nread_ms = 0.5\nwrite_ms = 0.5\n"
-LOST = (
-    LOCKSTEP
-    + """
-[supervision]
-restarts = 0
-[[fault]]
-kind = "kill"
-board = "{board}"
-tick = 1
-"""
-)
-"""A board is lost at once and not restarted."""
 NO_RESTART = "[supervision]\nrestarts = 0\n"
+KILLED = {"kind": "kill", "at": 0.5}
 ONE_LOSS = {
-    "kill-each-board": """
-[[fault]]
-kind = "kill"
-board = "servo"
-at = 0.5
-""",
-    "bad-sensors": """
-[[fault]]
-kind = "sensor-nan"
-board = "servo"
-joint = 2
-at = 0.5
-for = "50ms"
-""",
+    "kill-each-board": fault(board="servo", **KILLED),
+    "bad-sensors": fault(kind="sensor-nan", board="servo", joint=2, at=0.5, **{"for": "50ms"}),
 }
-"""Short scripts that replace the scripts of whole tasks."""
 
 
 WITHOUT_FORCE = """name = "without-force"
@@ -106,10 +73,7 @@ WITHOUT_SCHEDULE = (
     .replace('"../', f'"{CONFIGS}/')
     .replace('"realtime"', '"lockstep"')
 )
-ONE_AHEAD = """
-[board.planning.params]
-ahead = 1
-"""
+ONE_AHEAD = to_toml({"board": {"planning": {"params": {"ahead": 1}}}})
 ONLY_HOME = """
 [[task.step]]
 do = "home"
@@ -152,16 +116,11 @@ def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVe
 
 def with_a_lost_standby(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on a standby that is killed one tick before it would take over."""
-    at = replication.LOST_AT
-    early = f"{{kind='kill',board='servo.standby',tick={at - 1}}}"
-    crippled = replication.measure_loss(
-        workshop, f"fault=[{early},{replication.KILL}]", replication.STANDBY
-    )
-    return claim.judge(
-        replication.ReplicationRun(
-            undisturbed=replace(crippled, digest="of no loss"), alone=crippled, replicated=crippled
-        )
-    )
+    early = f"{{kind='kill',board='servo.standby',tick={replication.LOST_AT - 1}}}"
+    faults = f"fault=[{early},{replication.KILL}]"
+    crippled = replication.measure_loss(workshop, faults, replication.STANDBY)
+    undisturbed = replace(crippled, digest="of no loss")
+    return claim.judge(replication.ReplicationRun(undisturbed, crippled, crippled))
 
 
 def by_one_system(name: str) -> Judge:
@@ -200,7 +159,7 @@ class Breaking:
 
 
 UNEVEN = dict.fromkeys(("fig2", "fig4"), "[board.level.params]\nprocess_ms = [9.0, 1.0, 1.0]\n")
-LATE_SERVO = {"nasrem": LATE.format(board="servo", at=0.3)}
+LATE_SERVO = {"nasrem": fault(board="servo", at=0.3, **LATE)}
 ROWS = (
     Breaking("figure-1", "messages_lacking_share", LATE_SERVO, alone=True),
     Breaking("virtual-control-loop", "cycles_missed_share", LATE_SERVO, alone=True),
@@ -226,12 +185,17 @@ ROWS = (
     Breaking(
         "systems",
         "tasks_not_done",
-        {"condor": NO_RESTART + ONE_LOSS["kill-each-board"].replace("servo", "coordinator")},
+        {"condor": NO_RESTART + fault(board="coordinator", **KILLED)},
         judge=by_one_system("condor"),
         alone=True,
     ),
     *(
-        Breaking(claim, f"{box}.command_messages", {claim: LOCKSTEP, name: LOST.format(board=box)})
+        # The board is lost at once and not restarted.
+        Breaking(
+            claim,
+            f"{box}.command_messages",
+            {claim: LOCKSTEP, name: LOCKSTEP + NO_RESTART + fault(kind="kill", board=box, tick=1)},
+        )
         for claim, name, box in (
             ("rccl", "rccl", "joint1"),
             ("brown", "brown/servo", "supervisor"),
@@ -250,7 +214,9 @@ ROWS = (
     Breaking("penn", "force_requests 0, not >= 1", {"penn": WITHOUT_FORCE + LOCKSTEP}),
     Breaking("hic", "frames 0, not >= 1", {"hic": WITHOUT_SCHEDULE}, 0.5),
     Breaking("hic", "locked_mailboxes", {"hic": WITHOUT_SCHEDULE}, 0.5),
-    Breaking("hic", "ages_off_share", {"hic": DELAYED.format(board="joint", by=1) + LOCKSTEP}, 1.0),
+    Breaking(
+        "hic", "ages_off_share", {"hic": fault(board="joint", by=1, **DELAYED) + LOCKSTEP}, 1.0
+    ),
     Breaking("rccl", "requests_queued", {"rccl": ONLY_HOME + LOCKSTEP}),
     Breaking("rccl", "live_goal_followed_m", {"rccl": ONLY_HOME + LOCKSTEP}),
     Breaking("rccl", "slowest_blend_rad_s", {"rccl": ONE_AHEAD + LOCKSTEP}),
@@ -260,7 +226,7 @@ ROWS = (
     Breaking(
         "predictable-response",
         "lockstep_off_predicted_tick",
-        {"nasrem": DELAYED.format(board="primitive", by=3)},
+        {"nasrem": fault(board="primitive", by=3, **DELAYED)},
         # The last of the two holds ends at 5.4 s, and its response is below 2.4 s.
         8.0,
         alone=True,

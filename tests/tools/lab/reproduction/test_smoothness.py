@@ -12,7 +12,7 @@ from rack.tools.lab.reproduction.rules import judge_smoothness
 from rack.tools.lab.reproduction.verdict import Ruling, describe_unmet
 from tests.tools.lab.reproduction.breaking import BreakingWorkshop
 
-pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(300)]
 
 PUNCTUAL = f"""python_path = ["{Path(__file__).parent}"]
 [board.servo.params]

@@ -28,7 +28,6 @@ def test_a_wake_up_outside_the_planners_time_does_not_count_as_a_switch() -> Non
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 def test_a_switch_is_measured_with_real_processes_and_nothing_is_left() -> None:

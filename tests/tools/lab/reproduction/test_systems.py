@@ -9,7 +9,6 @@ from rack.boards.config.files import CONFIGS
 from rack.tools.lab.reproduction.experiments.mechanisms import measure_levels
 from rack.tools.lab.reproduction.system_claims import SYSTEMS
 from rack.tools.recording.recording import Recording
-from tests.shared_runs import nasrem_run
 
 
 def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
@@ -21,6 +20,6 @@ def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
 
 
 @pytest.mark.slow
-def test_levels_are_closed_loops_of_a_run(tmp_path_factory: pytest.TempPathFactory) -> None:
-    levels = measure_levels(Recording(nasrem_run(tmp_path_factory)))
+def test_levels_are_closed_loops_of_a_run(nasrem: Recording) -> None:
+    levels = measure_levels(nasrem)
     assert levels == (7, 26, 325, 2600)

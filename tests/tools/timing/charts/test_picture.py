@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from rack.boards.config import load, resolve_layout
@@ -22,34 +21,26 @@ def build_panel(rack: str, start_ms: float, end_ms: float) -> Panel:
     return schedule.build_panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
 
 
-def draw_texts(panel: Panel) -> tuple[list[Text], Figure]:
-    """Return the texts in the picture of a panel, with the layout of the saved picture."""
-    figure = Figure(figsize=(WIDTH_IN, 5.0), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    draw_panel(axes, panel)
-    canvas.draw()
-    return list(axes.texts), figure
-
-
-def spans_ns(panel: Panel, letter: str) -> list[tuple[int, int]]:
-    return [(s.start_ns, s.end_ns) for s in panel.chart.spans if s.unit.value == letter]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("rack", "end_ms"), [("fig2", 2.0), ("nasrem", 50.0)])
 def test_a_letter_is_no_wider_than_its_span(rack: str, end_ms: float) -> None:
     panel = build_panel(rack, 0.0, end_ms)
-    texts, figure = draw_texts(panel)
-    to_data = figure.axes[0].transData.inverted()
-    letters = [text for text in texts if text.get_text() in {unit.value for unit in Unit}]
+    figure = Figure(figsize=(WIDTH_IN, 5.0), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    draw_panel(axes, panel)
+    # With the layout of the saved picture.
+    canvas.draw()
+    to_data = axes.transData.inverted()
+    letters = [text for text in axes.texts if text.get_text() in {unit.value for unit in Unit}]
     assert letters
     for text in letters:
         extent: Bbox = text.get_window_extent()
         left, right = (to_data.transform((x, 0.0))[0] for x in (extent.x0, extent.x1))
         middle = (left + right) / 2
-        own = spans_ns(panel, text.get_text())
-        assert any(start <= left and right <= end for start, end in own if start < middle < end)
+        own = [s for s in panel.chart.spans if s.unit.value == text.get_text()]
+        around = [s for s in own if s.start_ns < middle < s.end_ns]
+        assert any(s.start_ns <= left and right <= s.end_ns for s in around)
 
 
 def test_the_numbers_of_frames_stand_above_their_columns() -> None:
