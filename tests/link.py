@@ -136,10 +136,11 @@ class Link:
                 reader.lock.close()
         self.segment.close()
 
-    def run(self, first: int, last: int) -> None:
-        """Do the ticks from `first` up to and without `last`."""
+    def run(self, first: int, last: int, writes: bool = True, reads: bool = True) -> None:
+        """Do the ticks from `first` up to and without `last`, of both ends or of one."""
         for tick in range(first, last):
-            due = [end for end in (self.writer, self.reader) if tick % end.every == 0]
+            ends = ((self.writer, writes), (self.reader, reads))
+            due = [end for end, does in ends if does and tick % end.every == 0]
             for end in reversed(due) if self._reader_first else due:
                 end.cycle(tick)
 
@@ -188,10 +189,8 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
         rack.run(begin + 60, begin + 120)
         rack.heal()
         rack.run(begin + 120, begin + 240)
-        for tick in range(begin + 240, begin + 264, rack.reader.every):
-            rack.reader.cycle(tick)
-        for tick in range(begin + 264, begin + 296, rack.writer.every):
-            rack.writer.cycle(tick)
+        rack.run(begin + 240, begin + 264, writes=False)
+        rack.run(begin + 264, begin + 296, reads=False)
         rack.run(begin + 296, begin + 400)
         written += rack.written()
     writer = rack.writer.ports.writers["point"]

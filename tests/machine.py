@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import pytest
 
-from rack.backplane.process import DEADLINE, Reservation, take_core
+from rack.backplane.process import DEADLINE, Reservation, set_priority, take_core
 from rack.tools.recording.cores import STAT, STEAL_COLUMN
 from tests.network_lab import Lab
 
@@ -29,16 +29,6 @@ REPEAT_S = 150.0
 """Time in which a run that the machine has disturbed is begun again: half the time-out of a
 test."""
 _FOLDER = Path(tempfile.gettempdir())
-
-
-def obtains_fifo() -> bool:
-    """Say whether this machine lets a process take a real-time priority."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    except PermissionError:
-        return False
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return True
 
 
 def obtains_deadlines() -> bool:
@@ -83,7 +73,9 @@ def run_undisturbed(
     return pytest.fail(f"the machine disturbed each of {len(found)} runs: {'; '.join(found)}")
 
 
-needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")
+needs_fifo = pytest.mark.skipif(
+    not (set_priority(1) and set_priority(0)), reason="needs real-time priorities"
+)
 needs_deadlines = pytest.mark.skipif(
     not obtains_deadlines(), reason="needs SCHED_DEADLINE on one core"
 )

@@ -20,14 +20,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from rack.backplane.process import wait_readable
 from rack.tools.console.answer import Failure
+from tests.processes import parent_of
 
 PREFIX = "rack-lab"
 NAMESPACES = Path("/run/netns")
 NET = "10.77.0"
 """The first three parts of all addresses."""
-MOST_MACHINES = 200
 ENDING = ((signal.SIGTERM, 5.0), (signal.SIGKILL, 2.0))
 """Signals to processes that are left at the end, and the time that they have after each, s."""
 PATIENCE_S = 30.0
@@ -50,8 +49,6 @@ class Lab:
     one fails."""
 
     def __init__(self, machines: int) -> None:
-        if not 1 <= machines <= MOST_MACHINES:
-            raise ValueError(f"{machines} machines: permitted are 1 to {MOST_MACHINES}")
         pid = os.getpid()
         lab = f"{PREFIX}-{pid}-{_read_start_time(str(pid))}-{next(_NUMBERS)}"
         self._hub = f"{lab}-hub"
@@ -64,13 +61,10 @@ class Lab:
         """Return why this process cannot have a lab, empty if it can."""
         if os.geteuid():
             return "network namespaces need root"
-        packages = {"ip": "iproute2", "nft": "nftables"}
-        missing = next((program for program in packages if shutil.which(program) is None), None)
-        return (
-            f"no program '{missing}'; to install: apt-get install {packages[missing]}"
-            if missing
-            else ""
-        )
+        for program, package in {"ip": "iproute2", "nft": "nftables"}.items():
+            if shutil.which(program) is None:
+                return f"no program '{program}'; to install: apt-get install {package}"
+        return ""
 
     def __enter__(self) -> Self:
         if why_not := self.is_possible():
@@ -123,8 +117,6 @@ class Lab:
 
     def lose(self, machine: int, share: float) -> None:
         """Drop that share of all packets to and from a machine, at random; 0 ends it."""
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"a share of {share:g}: permitted is 0 to 1")
         self._losses[machine] = share
         rules = [
             f'{way} "{_cable(number)}" numgen random mod 1000000 < {round(lost * 1e6)} drop'
@@ -134,13 +126,8 @@ class Lab:
         ]
         chain = ["chain wire {", "type filter hook forward priority 0", *rules, "}"]
         # All at once: the rules before this are gone, these are in force.
-        script = [
-            "table bridge loss",
-            "delete table bridge loss",
-            "table bridge loss {",
-            *chain,
-            "}",
-        ]
+        renewed = ["table bridge loss", "delete table bridge loss", "table bridge loss {"]
+        script = [*renewed, *chain, "}"]
         _call(["ip", "netns", "exec", self._hub, "nft", "--file", "-"], script)
 
     def unplug(self, machine: int) -> None:
@@ -162,8 +149,8 @@ def _ip(commands: Iterable[str], namespace: str | None = None) -> None:
     _call(["ip", *where, "-batch", "-"], commands)
 
 
-def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
-    """Run a command with these lines as its input, and return what it prints. Raises `Failure`."""
+def _call(argv: Sequence[str], lines: Iterable[str]) -> None:
+    """Run a command with these lines as its input. Raises `Failure`."""
     called = f"network lab: {' '.join(argv)}"
     text = "".join(f"{line}\n" for line in lines)
     try:
@@ -173,7 +160,6 @@ def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
         raise Failure(f"{called}: {why}")
-    return done.stdout
 
 
 def _stale() -> list[str]:
@@ -213,39 +199,17 @@ def _end(names: Sequence[str]) -> None:
                 with suppress(ProcessLookupError):
                     os.kill(pid, how)
             struck |= roots
-            _await_end(next(iter(inside)))
+            time.sleep(0.02)
 
 
 def _inside(names: Sequence[str]) -> dict[int, int]:
     """Return the processes in namespaces, each with its parent."""
-    spaces = set()
     found: dict[int, int] = {}
     for name in names:
-        try:
-            spaces.add((NAMESPACES / name).stat().st_ino)
-        except FileNotFoundError:
-            continue
-    if not spaces:
-        return found
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            if (path / "ns/net").stat().st_ino in spaces:
-                found[int(path.name)] = int(
-                    (path / "stat").read_text().rpartition(")")[2].split()[1]
-                )
-        except OSError:
-            # It has ended, or is none of ours: not even root may look at every process.
-            continue
+        command = ["ip", "netns", "pids", name]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+        for pid in map(int, done.stdout.split()):
+            # It may have ended.
+            with suppress(OSError):
+                found[pid] = parent_of(pid)
     return found
-
-
-def _await_end(pid: int) -> None:
-    """Wait a little for the end of a process."""
-    try:
-        pidfd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return
-    try:
-        wait_readable(pidfd, 0.1)
-    finally:
-        os.close(pidfd)

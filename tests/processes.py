@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rack.backplane.errors import SegmentError
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from tests import warm
@@ -62,14 +63,8 @@ def kill(pid: int) -> None:
 
 def exit_status(pid: int, bound_s: float = BOUND_S) -> int:
     """Wait for a child's end and return its exit status, negative for a signal."""
-    pidfd = os.pidfd_open(pid)
-    try:
-        wait_until(
-            lambda: os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None,
-            bound_s,
-        )
-    finally:
-        os.close(pidfd)
+    how = os.WEXITED | os.WNOHANG | os.WNOWAIT
+    wait_until(lambda: os.waitid(os.P_PID, pid, how) is not None, bound_s)
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
@@ -126,10 +121,7 @@ def in_thread(run: Callable[[], object]) -> Iterator[None]:
 
 def runs(pid: int) -> bool:
     """Say whether a process is there and no zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+    return is_alive(pid)
 
 
 def parent_of(pid: int) -> int:

@@ -24,12 +24,8 @@ Made by `make reference` from the models that check a config, with the levels of
 
 def page() -> str:
     """Return the page."""
-    return "\n".join([HEAD, *_lines()])
-
-
-def _lines() -> Iterator[str]:
-    for table in list_key_tables(load("nasrem")):
-        yield from _table(table)
+    tables = list_key_tables(load("nasrem"))
+    return "\n".join([HEAD, *(line for table in tables for line in _table(table))])
 
 
 def _table(table: KeyTable) -> Iterator[str]:

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
+from rack.tools.recording.recording import Recording
 from tests.conftest import SMALL
 
 SMALL_S = 4.0
@@ -90,5 +92,10 @@ def _run(folder: Path, name: str, seconds: float, settings: Sequence[str]) -> Pa
         config = folder / "small.toml"
         config.write_text(SMALL)
     rack = load(config, [f"name=test-shared-{name}-{os.getpid()}", *settings])
-    assert run_rack(rack, seconds, folder / "run", Display()).recording == "complete"
-    return folder / "run"
+    return record(rack, seconds, folder / "run").folder
+
+
+def record(config: RackConfig, seconds: float | None, folder: Path) -> Recording:
+    """Run a rack, without a limit to its own end, and return the complete recording."""
+    assert run_rack(config, seconds, folder, Display()).recording == "complete"
+    return Recording(folder)

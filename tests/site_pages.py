@@ -91,14 +91,13 @@ def _show(path: Path, config: MkDocsConfig) -> File:
         # mkdocs would leave out files in hidden folders.
         level = InclusionLevel.INCLUDED
         return File(uri, str(ROOT), config.site_dir, use_directory_urls=False, inclusion=level)
-    content = "\n".join(_list_files(path)) if path.is_dir() else _quote(path)
+    if path.is_dir():
+        content = "\n".join(_list_files(path))
+    else:
+        content = f"~~~~{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text()}\n~~~~"
     content = f"{GENERATED}# {uri}\n\n{content}\n"
     level = InclusionLevel.NOT_IN_NAV
     return File.generated(config, uri + _suffix(path), content=content, inclusion=level)
-
-
-def _quote(path: Path) -> str:
-    return f"~~~~{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text()}\n~~~~"
 
 
 def _list_files(folder: Path) -> Iterator[str]:

@@ -65,7 +65,8 @@ class Snapshots:
         known = self.known
         if WRITES in os.environ:
             known[case] = digest(found)
-            self._write()
+            entries = [f"{json.dumps(one)} = {json.dumps(known[one])}" for one in sorted(known)]
+            self._path.write_text("\n".join((HEAD, "", *entries, "")))
         is_same = known.get(case) == digest(found)
         assert is_same, f"{case}: other than before; meant? make golden; its parts: {found}"
 
@@ -84,11 +85,6 @@ class Snapshots:
     def known(self) -> dict[str, str]:
         """What the file says: digests by case."""
         return tomllib.loads(self._path.read_text()) if self._path.exists() else {}
-
-    def _write(self) -> None:
-        known = sorted(self.known.items())
-        cases = (f"{json.dumps(case)} = {json.dumps(found)}" for case, found in known)
-        self._path.write_text("\n".join((HEAD, "", *cases, "")))
 
 
 def digest(value: object) -> str:

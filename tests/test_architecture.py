@@ -95,11 +95,12 @@ def test_folders_form_no_circle() -> None:
 def test_files_form_no_circle() -> None:
     # Imports for types and inside functions count: a file that needs another to be understood needs
     # it.
-    files = {path: {file_of(name) for name in imported(path)} - {None} for path in SOURCES}
     refuse_circle(
         {
-            path.relative_to(ROOT): {file.relative_to(ROOT) for file in needed if file}
-            for path, needed in files.items()
+            path.relative_to(ROOT): {
+                file.relative_to(ROOT) for name in imported(path) if (file := file_of(name))
+            }
+            for path in SOURCES
         }
     )
 

@@ -8,10 +8,8 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pytest
@@ -114,7 +112,6 @@ def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> Ran:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_modification_of_the_general_machine_is_put_in_over_the_network_without_a_step(
     run: Ran,
 ) -> None:
@@ -155,7 +152,6 @@ def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> N
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 @needs_lab
 def test_one_command_runs_both_to_the_end_of_the_program(tmp_path: Path) -> None:
     command = [*RACK, "run", "brown", "--lockstep", "--no-record", "--json"]
@@ -200,34 +196,29 @@ class Launched:
         assert not [path.name for path in SHM_FOLDER.glob(f"*{self.name}*")]
         return self.process.returncode, said
 
+    def __enter__(self) -> Self:
+        return self
 
-@contextmanager
-def launched(folder: Path, name: str, *words: str) -> Iterator[Launched]:
-    """Launch both; should they still run at the end, both are killed."""
-    both = Launched(folder, name, *words)
-    try:
-        yield both
-    finally:
-        both.process.kill()
-        both.process.communicate()
+    def __exit__(self, *error: object) -> None:
+        """Kill both, should they still run."""
+        self.process.kill()
+        self.process.communicate()
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_an_interrupt_ends_both_and_leaves_nothing(rack_name: str, tmp_path: Path) -> None:
-    with launched(tmp_path, rack_name) as both:
+    with Launched(tmp_path, rack_name) as both:
         both.await_tick()
         both.process.send_signal(signal.SIGINT)
         assert both.await_end()[0] == 128 + signal.SIGINT
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_a_rack_that_cannot_be_launched_ends_the_other_with_status_1(
     rack_name: str, tmp_path: Path
 ) -> None:
     absent = 'adapter.lan.launch=["none/none.toml"]'
-    with launched(tmp_path, rack_name, "--set", absent) as both:
+    with Launched(tmp_path, rack_name, "--set", absent) as both:
         status, said = both.await_end()
     assert status == 1
     assert 'config = "none/none.toml": no such file' in said
@@ -235,13 +226,19 @@ def test_a_rack_that_cannot_be_launched_ends_the_other_with_status_1(
     assert '; none/none.toml: config = "none/none.toml": no such file' in said.splitlines()[-1]
 
 
+def reported(folder: Path, *words: str | Path) -> tuple[dict[str, Any], str]:
+    """Run a rack in a folder; return its report and stderr."""
+    command = [*RACK, "run", *words, "--json"]
+    done = run_command(command, MOST_S, cwd=folder, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), done.stderr
+
+
 def repeated(run: Path, out: Path) -> tuple[str, str]:
     """Continue a run from 1.3 s, in the middle of a modification, to 3 s; return digest and
     stderr."""
-    command = [*RACK, "run", "--from", f"{run}@1.3", "--seconds", "3", "--json", "--out", out]
-    done = run_command(command, MOST_S, text=True)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)["digest"], done.stderr
+    report, said = reported(run, "--from", f"{run}@1.3", "--seconds", "3", "--out", out)
+    return report["digest"], said
 
 
 def found_lost(run: Path) -> list[tuple[int, str]]:
@@ -252,15 +249,11 @@ def found_lost(run: Path) -> list[tuple[int, str]]:
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_a_run_of_either_rack_is_continued_without_the_other(
     rack_name: str, tmp_path: Path
 ) -> None:
     general = configs(rack_name, tmp_path, LINK_OUT)[1]
-    command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json"]
-    done = run_command(command, MOST_S, cwd=tmp_path, text=True)
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
+    report, _ = reported(tmp_path, general, "--lockstep", "--seconds", "3")
     for own, other in ((report, f"{rack_name}-servo"), (report["others"][0], rack_name)):
         digest, said = repeated(tmp_path / own["folder"], tmp_path / f"without {other}")
         assert f"not started: '{other}'; their recorded messages are replayed" in said
@@ -269,7 +262,6 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
 
 
 @pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> None:
     servo, general = configs(rack_name, tmp_path)
     alone = [*RACK, "run", general, "--lockstep", "--share", "--no-record", "--seconds", "1.6"]
@@ -299,15 +291,11 @@ def find_responses(report: dict[str, Any], direction: str, end: str) -> list[dic
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
     rack_name: str, tmp_path: Path
 ) -> None:
     general = configs(rack_name, tmp_path)[1]
-    command = [*RACK, "run", general, "--lockstep", "--seconds", "1.2", "--json", "--share"]
-    done = run_command(command, MOST_S, cwd=tmp_path, text=True)
-    assert done.returncode == 0, done.stderr
-    upper = json.loads(done.stdout)
+    upper, _ = reported(tmp_path, general, "--lockstep", "--seconds", "1.2", "--share")
     lower = json.loads((tmp_path / upper["others"][0]["folder"] / "report.json").read_text())
     assert not [text for one in (upper, lower) for text in one["unjudged"] if "response" in text]
     (status,) = find_responses(upper, "status", f"{rack_name}/planning")
@@ -334,7 +322,6 @@ def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
 
 @pytest.mark.thorough
 @pytest.mark.alone
-@pytest.mark.timeout(300)
 @needs_lab
 @pytest.mark.parametrize("delay_ms", [0, 5, 20, 50] if EXHAUSTIVE else [5, 50])
 def test_on_a_slow_network_each_long_response_has_a_cause(

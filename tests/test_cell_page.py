@@ -7,9 +7,7 @@ import json
 import re
 import shlex
 import subprocess
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,7 +18,7 @@ from tests.processes import RACK
 from tests.snapshots import Snapshots
 from tests.tools.command_line import rack
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(300), needs_lab]
+pytestmark = [pytest.mark.thorough, needs_lab]
 
 SNAPSHOTS = Snapshots(__file__)
 PAGE = (CONFIGS / "cell" / "README.md").read_text().replace("\\\n", "")
@@ -41,35 +39,24 @@ def test_the_page_of_networks_has_the_same_commands() -> None:
     assert [shlex.split(line, comments=True) for line in lines] == BLOCKS[0]
 
 
-def file_name(words: list[str]) -> str:
-    """Return the name of the files of a rack."""
-    return words[1].replace("/", "-")
-
-
-def outcomes(folder: Path, racks: Iterable[list[str]]) -> dict[str, dict[str, Any]]:
-    """Return the reports of racks that have ended, each with its task done."""
-    names = [file_name(words) for words in racks]
-    said = {name: (folder / f"{name}.err").read_text()[-1000:] for name in names}
-    texts = {name: (folder / f"{name}.json").read_text() for name in names}
-    assert all(texts.values()), said
-    found = {name: json.loads(text) for name, text in texts.items()}
-    causes = {name: report["outcome"]["cause"] for name, report in found.items()}
-    assert causes == dict.fromkeys(names, "task done"), said
-    return found
-
-
 def test_on_one_machine_in_lockstep_the_hand_over_is_the_same_everywhere(tmp_path: Path) -> None:
-    racks, _ = BLOCKS
+    commands, _ = BLOCKS
+    # By the name of the files of each rack.
+    racks = {words[1].replace("/", "-"): words for words in commands}
     script = ["ip link set lo up"]
-    for words in racks:
-        name = file_name(words)
+    for name, words in racks.items():
         command = shlex.join([*RACK, *words, "--lockstep", "--out", name, "--json"])
         script.append(f"{command} >{name}.json 2>{name}.err &")
     command = "\n".join([*script, "wait"])
     subprocess.run(
         [*ONE_MACHINE, *OWN_MEMORY, "bash", "-c", command], cwd=tmp_path, timeout=MOST_S, check=True
     )
-    found = outcomes(tmp_path, racks)
+    said = {name: (tmp_path / f"{name}.err").read_text()[-1000:] for name in racks}
+    texts = {name: (tmp_path / f"{name}.json").read_text() for name in racks}
+    assert all(texts.values()), said
+    found = {name: json.loads(text) for name, text in texts.items()}
+    causes = {name: report["outcome"]["cause"] for name, report in found.items()}
+    assert causes == dict.fromkeys(racks, "task done"), said
     if golden.machine()["libm"] == golden.read()["machine"]["libm"]:
         SNAPSHOTS.check("lockstep", {name: report["digest"] for name, report in found.items()})
     done = rack("analyze", *(tmp_path / name for name in found), "--json")

@@ -27,7 +27,6 @@ from tests.processes import run_to_end, wait_until
 EARLIEST = "clock.scheduler=earliest-deadline-first"
 URGENCY = "clock.scheduler=maximum-urgency-first"
 BOARDS = ("arm", "servo", "trajectory", "world", "bridge")
-FIXED = Scheduler.FIXED_PRIORITY
 PARTS = ("read", "process", "write")
 LOAD = "timing.lockstep_load=1"
 
@@ -126,7 +125,6 @@ def test_boards_are_scheduled_by_their_deadlines_on_their_cores(rack_name: str) 
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @needs_fifo
 def test_a_refused_scheduler_ends_the_launch_with_one_line(rack_name: str) -> None:
     # A cycle is longer than the kernel's longest period, 4.2 s, on any machine.
@@ -141,7 +139,6 @@ def test_a_refused_scheduler_ends_the_launch_with_one_line(rack_name: str) -> No
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @needs_fifo
 def test_a_board_goes_on_as_before_when_the_system_refuses_another_scheduler(
     rack_name: str,
@@ -151,7 +148,7 @@ def test_a_board_goes_on_as_before_when_the_system_refuses_another_scheduler(
         rack.command("world", "schedule", name="earliest-deadline-first", tick=2)
         rack.run(0.02)
         block = rack.segment.get_block("world")
-        assert (block[Block.SCHEDULER], block[Block.PRIORITY]) == (FIXED, 65)
+        assert (block[Block.SCHEDULER], block[Block.PRIORITY]) == (Scheduler.FIXED_PRIORITY, 65)
         (kept,) = [event for event in rack.events if event.code == "scheduler_kept"]
     assert kept.board == "world"
     assert kept.text.startswith("'world' goes on as before: earliest-deadline-first refused: ")
@@ -189,7 +186,6 @@ def run_overload(*settings: str, attempt: int = 1) -> Ran:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_under_an_overload_urgency_alone_spares_the_critical_boards() -> None:
     fixed = run_overload()
     earliest = run_overload(EARLIEST)
@@ -202,13 +198,6 @@ def test_under_an_overload_urgency_alone_spares_the_critical_boards() -> None:
     assert critical == {"arm", "servo", "trajectory"}
     assert {board for board, missed in urgency.missed.items() if missed} == {*BOARDS} - critical
     assert run_overload(EARLIEST, attempt=2) == earliest
-
-
-def predict_late(*settings: str) -> set[str]:
-    """Return the boards whose responses are too long by `rack check`."""
-    config = load("chimera/overload", ["clock.mode=lockstep", *settings])
-    timing = build_rack_timing(config, resolve(config).layout)
-    return {response.task for response in timing.responses if not response.holds}
 
 
 LESS, LEAST = (f"board.world.budget.process_ms={ms}" for ms in (2.4, 1.6))
@@ -236,7 +225,9 @@ def test_the_check_predicts_which_boards_are_late_under_each_scheduler(
     settings: tuple[str, ...], count: int
 ) -> None:
     late = {board for board, missed in run_overload(*settings).missed.items() if missed}
-    predicted = predict_late(*settings)
+    config = load("chimera/overload", ["clock.mode=lockstep", *settings])
+    timing = build_rack_timing(config, resolve(config).layout)
+    predicted = {response.task for response in timing.responses if not response.holds}
     assert late <= predicted
     assert bool(late) == bool(predicted)
     assert len(late) == count
@@ -249,12 +240,11 @@ def test_without_an_overload_no_board_misses_a_deadline() -> None:
 
 CHANGE = [
     f"{{level='{board}', what='schedule', name='maximum-urgency-first', tick=100}}"
-    for board in ("arm", "servo", "trajectory", "world", "bridge")
+    for board in BOARDS
 ]
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_schedulers_change_while_the_rack_runs_and_the_arm_goes_on_when_told() -> None:
     held = run_overload(EARLIEST)
     assert re.match("deadline missed before tick [0-9]+: `resume` of trajectory or", held.reason)
@@ -292,7 +282,6 @@ def test_an_operator_changes_the_scheduler_of_a_starved_board(rack_name: str) ->
         rack.stop()
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_the_comparison_is_the_one_on_the_page() -> None:
     script = Path(__file__).parents[1] / "configs/chimera/compare_schedulers.py"

@@ -19,7 +19,7 @@ from rack.levels.systems.hand.messages import GraspKind
 from rack.tools.recording.recording import Recording
 from tests.tools.command_line import rack
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 FINGERS = ("index", "middle", "ring", "thumb")
 
 

@@ -63,7 +63,6 @@ def run(line: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(3 * BOUND_S)
 @pytest.mark.parametrize("number", range(len(EXERCISES)), ids=EXERCISES)
 def test_exercise_and_its_answer_show_what_their_pages_say(number: int, tmp_path: Path) -> None:

@@ -48,7 +48,6 @@ def part_in_time() -> float:
     return float(json.loads(done.stdout)["in_time"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=ALONE if name in REAL_TIME else []) for name in FOLDERS],

@@ -18,11 +18,6 @@ def test_every_run_has_a_golden_digest_and_none_is_left_over(
     assert set(known["digests"]) == set(golden.RUNS)
 
 
-@pytest.fixture(scope="module")
-def here() -> dict[str, str]:
-    return golden.machine()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "run",
@@ -34,8 +29,9 @@ def here() -> dict[str, str]:
     ],
 )
 def test_a_shipped_rack_has_its_golden_digest(
-    run: str, rack_name: str, known: dict[str, dict[str, str]], here: dict[str, str]
+    run: str, rack_name: str, known: dict[str, dict[str, str]]
 ) -> None:
+    here = golden.machine()
     others = {
         name: (there, here[name]) for name, there in known["machine"].items() if here[name] != there
     }

@@ -19,7 +19,7 @@ from tests.processes import run_to_end, wait_until
 from tests.test_course import is_shown
 from tests.tools.command_line import rack
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 BLOCK = re.compile(
     r"(?:^ *<!-- test: (?P<mark>[\w .-]+) -->\n)?"
@@ -108,12 +108,6 @@ class PageShell:
             assert self.background.wait(BOUND_S) in (0, 1)
             self.background = None
 
-    def close(self) -> None:
-        """Kill the command in the other terminal if the page has failed."""
-        if self.background is not None:
-            self.background.kill()
-            self.background.wait(BOUND_S)
-
 
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[PageShell]:
@@ -123,7 +117,10 @@ def shell(tmp_path: Path) -> Iterator[PageShell]:
     shutil.copytree(ROOT / "configs" / "examples" / "own-hardware", folder)
     made = PageShell(folder, f"page-{os.getpid()}")
     yield made
-    made.close()
+    if made.background is not None:
+        # The page has failed.
+        made.background.kill()
+        made.background.wait(BOUND_S)
 
 
 @pytest.mark.timeout(900)

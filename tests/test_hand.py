@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
-from rack.tools.recording.recording import Recording
 from tests.levels.arms import ROBOTS
+from tests.shared_runs import record
 
 SECONDS, KILLED_S = 0.5, 0.2
 RACK = f"""
@@ -56,9 +54,7 @@ at = {KILLED_S}
 @pytest.mark.slow
 def test_restarted_board_goes_on_with_the_hand_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "hand.toml").write_text(RACK)
-    result = run_rack(load(tmp_path / "hand.toml"), SECONDS, tmp_path / "run", Display())
-    assert result.recording == "complete"
-    run = Recording(tmp_path / "run")
+    run = record(load(tmp_path / "hand.toml"), SECONDS, tmp_path / "run")
     tick, position, stopped = (
         run.read_signal("hand.status", name) for name in ("tick", "position", "stopped")
     )

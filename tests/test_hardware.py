@@ -32,7 +32,6 @@ def ran(seconds: float, *settings: str) -> tuple[Outcome, list[Event], Message]:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_hardware_is_enabled_homed_faulted_reset_and_killed_and_goes_on() -> None:
     commands = (
         given("enable", 0.2),

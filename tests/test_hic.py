@@ -10,11 +10,10 @@ import pytest
 
 from rack.boards.config import build_rack_timing, load, resolve
 from rack.boards.timing.frames import compute_core_frames
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import build_report, summarize_data_ages
 from rack.tools.report.report_markdown import format_markdown
+from tests.shared_runs import record
 
 SECONDS = 3.0
 FRAME = 4
@@ -28,8 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Return a run in which the fingers close on the can."""
     folder = tmp_path_factory.mktemp("hic") / "run"
     config = load("hic", [f"name=test-hic-{os.getpid()}", "clock.mode=lockstep"])
-    assert run_rack(config, SECONDS, folder, Display()).recording == "complete"
-    return Recording(folder)
+    return record(config, SECONDS, folder)
 
 
 @pytest.mark.thorough

@@ -13,11 +13,9 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.commands.status import status
 from rack.tools.console.answer import Failure
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.plots.graph import build_graph
-from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
+from tests.shared_runs import record
 
 pytestmark = pytest.mark.thorough
 
@@ -31,19 +29,12 @@ MUTES = [*(("servo", at) for at in np.arange(8.25, 27.0, 0.5)), ("motion", 10.0)
 lowered."""
 
 
-@pytest.mark.slow
 def test_brakings_while_each_block_is_lowered_count_as_no_touch_and_each_is_put_down(
     tmp_path: Path,
 ) -> None:
-    script = tmp_path / "mutes.toml"
-    faults = [
-        f'[[fault]]\nkind = "mute"\nboard = "{board}"\nat = {at}\ncycles = 5\n'
-        for board, at in MUTES
-    ]
-    script.write_text("\n".join(faults))
-    config = load("ibm", [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep"], str(script))
-    assert run_rack(config, None, tmp_path / "run", Display()).recording == "complete"
-    recording = Recording(tmp_path / "run")
+    faults = ", ".join(f"{{kind='mute', board='{name}', at={at}, cycles=5}}" for name, at in MUTES)
+    settings = [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep", f"fault=[{faults}]"]
+    recording = record(load("ibm", settings), None, tmp_path / "run")
     ticks, current = (
         recording.read_signal("motion.status", field) for field in ("tick", "current")
     )
@@ -74,22 +65,18 @@ REFUSED = {
 """Connections that the blocks refuse, and why."""
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_connection_made_while_it_runs_ends_the_next_guarded_motion_sooner_and_repeats(
     tmp_path: Path,
 ) -> None:
     # The stop of the first block is as before, that of the second listens to a lighter touch.
     wires = dict(zip(REFUSED, (2.0, 4.0, 6.0, 8.0), strict=True)) | {"stop.input=light.output": 15}
-    commands = [
-        f"[[command]]\nlevel = 'blocks'\nwhat = 'set'\nname = 'wire=\"{wire}\"'\nat = {at}\n"
+    commands = ", ".join(
+        f"{{level='blocks', what='set', name='wire=\"{wire}\"', at={at}}}"
         for wire, at in wires.items()
-    ]
-    file = tmp_path / "wired.toml"
-    file.write_text(f'format = 2\nname = "wired"\nextends = ["ibm"]\n{"".join(commands)}')
-    config = load(file, [f"name=test-ibm-wired-{os.getpid()}", "clock.mode=lockstep"])
-    assert run_rack(config, None, tmp_path / "run", Display()).recording == "complete"
-    recording = Recording(tmp_path / "run")
+    )
+    settings = [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep", f"command=[{commands}]"]
+    config = load("ibm", settings)
+    recording = record(config, None, tmp_path / "run")
     texts = [event["text"] for event in recording.events if event["kind"] == "printed"]
     heights = [float(text.split()[-2]) for text in texts if "touched" in text]
     assert heights[0] == pytest.approx(0.4737, abs=1e-4)

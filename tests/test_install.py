@@ -89,7 +89,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
-@pytest.mark.slow
 def test_the_wheel_runs_the_nasrem_rack_from_another_folder(
     installed: Path, tmp_path: Path
 ) -> None:
@@ -104,7 +103,6 @@ def test_the_wheel_runs_the_nasrem_rack_from_another_folder(
     assert (report["worked"], report["simulated_s"]) == (True, 1.0)
 
 
-@pytest.mark.slow
 def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_path: Path) -> None:
     for package, file, text in (
         ("tools", "numbers.py", "THREE = 3\n"),
@@ -118,7 +116,6 @@ def test_folders_of_a_user_may_be_called_tools_and_levels(installed: Path, tmp_p
     assert json.loads(run(tmp_path, installed / "rack", *words))["worked"]
 
 
-@pytest.mark.slow
 def test_wheel_and_source_archive_are_of_one_version(installed: Path, tmp_path: Path) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     version = project["version"]
@@ -156,7 +153,6 @@ def test_a_package_rack_of_others_that_is_found_first_is_named(tmp_path: Path) -
     )
 
 
-@pytest.mark.slow
 def test_a_distribution_rack_that_was_installed_over_ours_is_named(installed: Path) -> None:
     place = next(installed.parent.glob("lib/python3*/site-packages/rack/__init__.py"))
     other = place.parents[1] / "rack-0.1.4.dist-info"

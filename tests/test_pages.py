@@ -27,7 +27,7 @@ from tests.pages import BLOCK, README, REFERENCES, ROOT, SHELL
 from tests.processes import RACK, run_to_end, wait_until
 from tests.tools.command_line import BOUND_S, rack
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 OWN_NAME = f"pages-{os.getpid()}"
 OWN = ("--set", f"name={OWN_NAME}", "--set", "supervision.max_missed_fraction=1", "--share")
@@ -106,18 +106,14 @@ OTHER_TESTS = {
 with the test that runs it."""
 
 
-def lines_of(page: Path) -> dict[str, int]:
-    """Return the commands of a page without their remarks, with the exit status that these have."""
-    blocks = SHELL.findall(page.read_text())
-    parts = [line.partition("#") for block in blocks for line in block.splitlines()]
-    return {
-        line.strip(): int("exit status 1" in remark)
-        for line, _, remark in parts
-        if line.startswith("rack ")
-    }
-
-
-LINES = {line: status for page in REFERENCES for line, status in lines_of(page).items()}
+LINES = {
+    line.strip(): int("exit status 1" in remark)
+    for page in REFERENCES
+    for block in SHELL.findall(page.read_text())
+    for line, _, remark in (line.partition("#") for line in block.splitlines())
+    if line.startswith("rack ")
+}
+"""Commands of the pages without their remarks, with the exit status that these have."""
 
 
 def kind_of(line: str) -> str:
@@ -132,11 +128,6 @@ def kind_of(line: str) -> str:
 def of_kind(kind: str) -> list[str]:
     """Return the commands of all pages that one test runs, each once."""
     return [line for line in LINES if kind_of(line) == kind]
-
-
-def list_running() -> list[str]:
-    """Return the commands on a running rack in the order of the pages; those that end it last."""
-    return sorted(of_kind("running"), key=lambda line: line.startswith("rack stop"))
 
 
 def words_of(line: str) -> list[str]:
@@ -187,15 +178,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def on_own_runs(line: str) -> list[str]:
-    """Return the words of a command on a recorded run, for the runs of the fixture."""
-    for name, own in NAMES.items():
-        line = line.replace(name, own)
-    words = shlex.split(line)[1:]
-    # Not opened: written to a file.
-    return [*words, "--out", "shown.rrd"] if words[0] == "replay" else words
-
-
 @pytest.mark.parametrize("line", of_kind("recorded"))
 def test_a_command_on_a_recorded_run_works(
     line: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -203,7 +185,12 @@ def test_a_command_on_a_recorded_run_works(
     for name in ("whole", "branch"):
         shutil.copytree(runs / name, tmp_path / name)
     monkeypatch.setattr(sys, "stdin", StringIO("goto 6\nshow primitive.status\n"))
-    done = rack(*on_own_runs(line), folder=tmp_path)
+    own = line
+    for name, of_test in NAMES.items():
+        own = own.replace(name, of_test)
+    # A replay is not opened: it is written to a file.
+    shown = ("--out", "shown.rrd") if own.startswith("rack replay") else ()
+    done = rack(*shlex.split(own)[1:], *shown, folder=tmp_path)
     # What `analyze` finds depends on the speed of this machine.
     statuses = (0, 1) if "analyze" in line else (int("report" in line and "--against" in line),)
     assert done.returncode in statuses, done.stderr
@@ -249,7 +236,8 @@ def start_watching(words: list[str], folder: Path) -> subprocess.Popen[str]:
 def test_the_commands_on_a_running_rack_work_in_their_order(tmp_path: Path) -> None:
     watching = []
     with running_rack(tmp_path):
-        for line in list_running():
+        # In the order of the pages; those that end the rack last.
+        for line in sorted(of_kind("running"), key=lambda line: line.startswith("rack stop")):
             for shown, own in REPLACED.items():
                 line = line.replace(shown, own)
             words = shlex.split(line)[1:]

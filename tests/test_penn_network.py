@@ -21,7 +21,7 @@ from tests.machine import needs_fifo, needs_lab
 from tests.network_lab import Lab
 from tests.processes import RACK, wait_until
 
-pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.thorough, pytest.mark.alone]
 
 ROOT = Path(__file__).parents[1]
 NAME = f"test-penn-{os.getpid()}"

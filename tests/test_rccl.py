@@ -12,10 +12,9 @@ import pytest
 
 from rack.backplane.message import State
 from rack.boards.config import CONFIGS, load
-from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from tests.processes import RACK
+from tests.shared_runs import record
 from tests.warm import run_command
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(240)]
@@ -30,8 +29,7 @@ def test_a_planner_that_stalls_for_2_s_leaves_the_arm_to_finish_its_queue_and_ho
     tmp_path: Path,
 ) -> None:
     config = load("rccl/stalled-planner", [f"name=test-rccl-{os.getpid()}", "clock.mode=lockstep"])
-    assert run_rack(config, SECONDS, tmp_path / "run", Display()).recording == "complete"
-    run = Recording(tmp_path / "run")
+    run = record(config, SECONDS, tmp_path / "run")
     plans = run.read_trace("planning.planner")["tick"]
     gap = int(np.diff(plans).argmax())
     assert plans[gap] < HANG_TICK
@@ -137,16 +135,7 @@ def test_two_arms_with_queues_of_their_own_begin_their_motions_in_the_same_tick(
 
 
 def test_a_trajectory_level_without_a_partner_refuses_to_meet(tmp_path: Path) -> None:
-    (tmp_path / "alone.toml").write_text(
-        f"""
-extends = ["rccl"]
-name = "test-alone-{os.getpid()}"
-clock.mode = "lockstep"
-
-[task]
-step = [{{ do = "meet" }}]
-"""
-    )
-    run_rack(load(tmp_path / "alone.toml"), SECONDS, tmp_path / "run", Display())
-    reasons = Recording(tmp_path / "run").read_signal("trajectory.status", "reason")
+    settings = [f"name=test-alone-{os.getpid()}", "clock.mode=lockstep", "task.step=[{do='meet'}]"]
+    run = record(load("rccl", settings), SECONDS, tmp_path / "run")
+    reasons = run.read_signal("trajectory.status", "reason")
     assert "kind 8; permitted: 1 to 5" in str(reasons[-1])

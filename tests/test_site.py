@@ -15,7 +15,7 @@ from tests.pages import ROOT, list_pages
 from tests.processes import run_to_end
 
 BOUND_S = 300
-pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(BOUND_S + 20)]
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(BOUND_S + 20)]
 
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", ".*_cache", "__pycache__", "dist", "runs")
 BROKEN = {

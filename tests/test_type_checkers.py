@@ -10,7 +10,7 @@ import pytest
 
 from tests.processes import run_to_end
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 
 BOUND_S = 110
 OWN = '''

@@ -37,46 +37,37 @@ def mailbox(
     name: str = NAME,
     writer: str = "writer",
     capacity: int = 0,
+    reader: str = "reader",
+    kind: type[Message] = Point,
 ) -> MailboxSpec:
-    """Return the spec of a mailbox of points; under protocol interrupt they are sent early enough
-    for `delay`."""
+    """Return the spec of a mailbox, of points by default; under protocol interrupt they are sent
+    early enough for `delay`."""
     interrupt = InterruptSpec(delay * CLOCK_NS - SPARE_NS, SERVICE_NS, 16, delay, delay, slots=(3,))
     return MailboxSpec(
         name=name,
         writer=writer,
-        readers=("reader",),
+        readers=(reader,),
         protocol=protocol,
         every=every,
         delay=delay,
         depth=depth,
-        message=Point.message_type.name,
-        version=Point.message_type.version,
-        size=Point.message_type.build_dtype(SIZES).itemsize,
-        fields=build_field_specs(Point.message_type, SIZES),
+        message=kind.message_type.name,
+        version=kind.message_type.version,
+        size=kind.message_type.build_dtype(SIZES).itemsize,
+        fields=build_field_specs(kind.message_type, SIZES),
         capacity=capacity,
         interrupt=interrupt if protocol == "interrupt" else None,
     )
 
 
-def queue(
-    capacity: int, rates: tuple[int, int] = (1, 1), slots: int = 64
-) -> tuple[MailboxSpec, MailboxSpec]:
+def queue(capacity: int, rates: tuple[int, int] = (1, 1)) -> tuple[MailboxSpec, MailboxSpec]:
     """Return the specs of a queue of points and of its reader's position; `rates` are both tasks'
     periods."""
     written, read = rates
-    box = mailbox("queue", every=written, delay=written, depth=slots, capacity=capacity)
-    position = MailboxSpec(
-        name=get_position_mailbox(NAME),
-        writer="reader",
-        readers=("writer",),
-        protocol="time-slice",
-        every=read,
-        delay=read,
-        depth=64,
-        message=QueueTaken.message_type.name,
-        version=QueueTaken.message_type.version,
-        size=QueueTaken.message_type.build_dtype({}).itemsize,
-        fields=build_field_specs(QueueTaken.message_type, {}),
+    box = mailbox("queue", every=written, delay=written, depth=64, capacity=capacity)
+    name = get_position_mailbox(NAME)
+    position = mailbox(
+        "time-slice", read, read, 64, name, writer="reader", reader="writer", kind=QueueTaken
     )
     return box, position
 

@@ -11,11 +11,10 @@ from rack.backplane import exclusive_cores
 from rack.backplane.exclusive_cores import enter_core, release_cores, reserve_cores
 
 PARTITION = "cpuset.cpus.partition"
-Hierarchy = Path
 
 
 @pytest.fixture
-def hierarchy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hierarchy:
+def hierarchy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A hierarchy with the controller `cpuset`, whose folders are removed as the kernel does."""
     root = tmp_path / "cgroup"
     root.mkdir()
@@ -33,11 +32,11 @@ def hierarchy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hierarchy:
     return root
 
 
-def list_groups(root: Hierarchy) -> list[str]:
+def list_groups(root: Path) -> list[str]:
     return sorted(path.name for path in root.iterdir() if path.is_dir())
 
 
-def test_each_core_is_a_partition_that_its_tasks_enter(hierarchy: Hierarchy) -> None:
+def test_each_core_is_a_partition_that_its_tasks_enter(hierarchy: Path) -> None:
     assert reserve_cores("arm", [1, 0, 1]) == ""
     assert list_groups(hierarchy) == ["rack.arm.0", "rack.arm.1"]
     assert (hierarchy / "cgroup.subtree_control").read_text() == "+cpuset"
@@ -50,7 +49,7 @@ def test_each_core_is_a_partition_that_its_tasks_enter(hierarchy: Hierarchy) -> 
     assert list_groups(hierarchy) == ["rack.arm.1"]
 
 
-def test_groups_of_a_killed_rack_are_replaced_or_removed(hierarchy: Hierarchy) -> None:
+def test_groups_of_a_killed_rack_are_replaced_or_removed(hierarchy: Path) -> None:
     for name in ("arm", "hand", "arm-2"):
         assert reserve_cores(name, [0]) == ""
     assert reserve_cores("arm", [1]) == ""
@@ -63,7 +62,7 @@ REFUSAL = "root invalid (Parent unable to distribute cpu downstream)"
 
 
 def test_a_refused_partition_leaves_no_group(
-    hierarchy: Hierarchy, monkeypatch: pytest.MonkeyPatch
+    hierarchy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read_text = Path.read_text
 
@@ -85,7 +84,7 @@ def test_a_refused_partition_leaves_no_group(
     ],
 )
 def test_a_machine_without_partitions_says_why(
-    hierarchy: Hierarchy, controllers: str | None, mounted: bool, refusal: str
+    hierarchy: Path, controllers: str | None, mounted: bool, refusal: str
 ) -> None:
     (hierarchy / "cgroup.controllers").unlink()
     if controllers is not None:

@@ -17,19 +17,15 @@ def bus(make_bus: MakeBus) -> Segment:
     return make_bus(task("low", slot=21), task("high", slot=2), task("high.planner", slot=2))
 
 
-def test_a_board_holds_sysfail_until_its_self_test_has_passed(bus: Segment) -> None:
+def test_a_board_holds_sysfail_until_its_self_test_has_passed_and_when_it_fails(
+    bus: Segment,
+) -> None:
     lines = UtilityLines(bus)
     assert lines.sysfail == [2, 21]
     lines.release_sysfail(2)
     assert UtilityLines(Segment.attach(bus.rack)).sysfail == [21]
     lines.release_sysfail(21)
     assert lines.sysfail == []
-
-
-def test_a_board_that_fails_holds_sysfail_again(bus: Segment) -> None:
-    lines = UtilityLines(bus)
-    for slot in (2, 21):
-        lines.release_sysfail(slot)
     lines.assert_sysfail(21)
     assert lines.sysfail == [21]
 

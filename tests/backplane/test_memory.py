@@ -12,8 +12,9 @@ from rack.backplane.memory import touch_memory
 from rack.backplane.segment import Segment
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, exit_status, fork, kill
+from tests.processes import FORKS, exit_status, fork
 
+pytestmark = pytest.mark.filterwarnings(FORKS)
 PAGES = 4096
 FEW = 64
 """Pages used by the process itself: its stack, its allocator, the interpreter's code."""
@@ -34,16 +35,6 @@ def use(memory: bytearray | memoryview) -> None:
         memory[at] = memory[at]
 
 
-def holds_in_a_child(condition: Callable[[], bool]) -> bool:
-    """Return what a forked process finds."""
-    child = fork(condition)
-    try:
-        return exit_status(child) == 0
-    finally:
-        kill(child)
-
-
-@pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("touched", [True, False])
 def test_a_forked_process_copies_no_page_later_once_it_has_touched_them(touched: bool) -> None:
     shared = bytearray(PAGES * mmap.PAGESIZE)
@@ -56,10 +47,9 @@ def test_a_forked_process_copies_no_page_later_once_it_has_touched_them(touched:
         # Huge pages, where the system uses them, are copied in one piece.
         return found < FEW if touched else found >= PAGES // 512
 
-    assert holds_in_a_child(board)
+    assert exit_status(fork(board)) == 0
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_the_whole_segment_is_mapped_once_touched(make_bus: MakeBus) -> None:
     segment: Segment = make_bus(mailbox(depth=1 << 14))
     pages = len(segment.bytes) // mmap.PAGESIZE
@@ -69,10 +59,9 @@ def test_the_whole_segment_is_mapped_once_touched(make_bus: MakeBus) -> None:
         touch_memory()
         return faults(lambda: use(mapped.bytes)) < FEW < pages // 16
 
-    assert holds_in_a_child(board)
+    assert exit_status(fork(board)) == 0
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_memory_given_back_stays_with_the_process() -> None:
     def board() -> bool:
         touch_memory()
@@ -81,4 +70,4 @@ def test_memory_given_back_stays_with_the_process() -> None:
         use(bytearray(LARGE))
         return faults(lambda: [use(bytearray(LARGE)) for _ in range(10)]) < FEW
 
-    assert holds_in_a_child(board)
+    assert exit_status(fork(board)) == 0

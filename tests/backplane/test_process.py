@@ -45,12 +45,6 @@ from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
 
-def test_a_running_process_is_alive() -> None:
-    assert is_alive(os.getpid())
-    assert not is_alive(0)
-    assert not is_alive(-1)
-
-
 def test_a_killed_process_is_ending_before_it_has_ended() -> None:
     """It first frees its memory, and is in state R meanwhile."""
 
@@ -102,6 +96,7 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(
 
 def test_the_kernel_says_in_which_state_a_process_is() -> None:
     assert read_state(os.getpid()) == "R"
+    assert [is_alive(pid) for pid in (os.getpid(), 0, -1)] == [True, False, False]
     with forked(signal.pause) as pid:
         wait_until(lambda: read_state(pid) in WAITING_STATES)
         os.kill(pid, signal.SIGSTOP)
@@ -180,9 +175,6 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
     assert exit_status(fork(be_ordinary)) == 0
 
 
-SCHED_DEADLINE = 6
-
-
 @needs_deadlines
 def test_a_reservation_applies_to_the_process_on_its_core() -> None:
     cores = os.sched_getaffinity(0)
@@ -190,7 +182,7 @@ def test_a_reservation_applies_to_the_process_on_its_core() -> None:
     def take() -> bool:
         assert take_core(min(cores), 5, Reservation(100_000, 10_000_000)) == DEADLINE
         assert os.sched_getaffinity(0) == {min(cores)}
-        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == SCHED_DEADLINE
+        assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == 6  # SCHED_DEADLINE
         # The kernel refuses a fork that would double what is reserved.
         child = fork(lambda: os.sched_getscheduler(0) == os.SCHED_OTHER)
         return exit_status(child) == 0 and set_priority(0)

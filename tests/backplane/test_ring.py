@@ -15,7 +15,7 @@ from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, fork, kill, wait_until
+from tests.processes import FORKS, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 DEPTH = 16
@@ -74,24 +74,21 @@ def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
     assert lost == written - len(found)
 
 
-def hammer(segment: Segment) -> None:
-    writer = open_writer(segment, NAME)
-    while True:
-        write(writer, 1)
-
-
 @pytest.mark.slow
 def test_every_row_is_whole_or_counted_while_a_writer_hammers(bus: Segment) -> None:
     ring, taken, lost = MailboxRing(bus, NAME), 0, 0
-    writer = fork(lambda: hammer(bus))
-    try:
+
+    def hammer() -> None:
+        writer = open_writer(bus, NAME)
+        while True:
+            write(writer, 1)
+
+    with forked(hammer):
         while taken < 8_000:
             wait_until(lambda: ring.waiting_count)
             rows, missing = ring.read_new_rows()
             assert (rows["message"]["row"] == rows["serial"][:, np.newaxis]).all()
             assert (np.diff(rows["serial"]) == 1).all()
             taken, lost = taken + len(rows), lost + missing
-    finally:
-        kill(writer)
     rows, missing = ring.read_new_rows()
     assert taken + len(rows) + lost + missing == MailboxRing(bus, NAME).waiting_count

@@ -212,7 +212,6 @@ def test_a_launcher_counts_as_alive_until_it_releases_its_lock(make_bus: MakeBus
     other.close()
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_killed_launcher_is_dead_though_a_process_that_it_forked_lives_on(rack_name: str) -> None:
     reading, writing = os.pipe()
 

@@ -21,6 +21,7 @@ from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
 
+pytestmark = pytest.mark.filterwarnings(FORKS)
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
 """From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the
 wall clock."""
@@ -33,16 +34,12 @@ def bus(make_bus: MakeBus) -> Segment:
     )
 
 
-def test_tasks_have_two_semaphores_and_locked_mailboxes_one_in_separate_cache_lines(
-    bus: Segment,
-) -> None:
+def test_semaphores_are_in_separate_cache_lines_and_only_locks_start_posted(bus: Segment) -> None:
+    # Tasks have two, and locked mailboxes one.
     places = bus.map
     found = [*places.wake.values(), *places.done.values(), *places.locks.values()]
     assert len(found) == len({address // CACHE_LINE for address in found}) == 5
     assert all(max(places.mailboxes.values()) < at for at in found)
-
-
-def test_locks_start_free_and_wake_ups_start_unposted(bus: Segment) -> None:
     assert get_lock_semaphore(bus, NAME).value == 1
     assert get_wake_semaphore(bus, "writer").value == 0
     assert get_done_semaphore(bus, "writer").value == 0
@@ -64,7 +61,6 @@ def test_a_wait_lasts_until_its_deadline(bus: Segment) -> None:
     assert semaphore.acquire(0.02)
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_release_ends_a_wait(bus: Segment) -> None:
     semaphore = get_wake_semaphore(bus, "writer")
     parent = os.getpid()
@@ -81,18 +77,16 @@ def test_a_release_ends_a_wait(bus: Segment) -> None:
     assert not semaphore.try_acquire()
 
 
-def wait_for_release(segment: Segment) -> None:
-    NextCycle(segment, "writer").wait()
-
-
-def wait_for_lock(segment: Segment) -> None:
-    MailboxLock(segment, NAME, 60).acquire()
-    MailboxLock(segment, NAME, 60).acquire()
-
-
 def wait_for_tasks(segment: Segment) -> None:
     segment.get_block("writer")[Block.RELEASED] = 0
     LockstepDriver(segment, lambda tick: None, False, 8).run()
+
+
+WAITS: dict[str, Callable[[Segment], object]] = {
+    "release": lambda segment: NextCycle(segment, "writer").wait(),
+    "lock": lambda segment: [MailboxLock(segment, NAME, 60).acquire() for _ in range(2)],
+    "tasks": wait_for_tasks,
+}
 
 
 def futex_call(pid: int) -> int:
@@ -103,14 +97,11 @@ def futex_call(pid: int) -> int:
     return operation if operation & ~FUTEX_CLOCK_REALTIME == FUTEX_WAIT_BITSET else 0
 
 
-@pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("wait", [wait_for_release, wait_for_lock, wait_for_tasks])
-def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(
-    bus: Segment, wait: Callable[[Segment], None]
-) -> None:
+@pytest.mark.parametrize("wait", WAITS)
+def test_no_step_of_the_wall_clock_moves_the_bound_of_a_wait(bus: Segment, wait: str) -> None:
     # A test cannot set the machine's clock. The kernel shows by which clock a process waits.
     seen = [0]
-    with forked(lambda: wait(bus)) as pid:
+    with forked(lambda: WAITS[wait](bus)) as pid:
         try:
             wait_until(lambda: seen.append(futex_call(pid)) or seen[-1])
         except PermissionError:

@@ -15,7 +15,7 @@ from rack.levels.level import LevelContext
 from rack.levels.messages import ArmState
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import Cell, build_cell, compute_sizes
-from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
+from rack.levels.tables import RobotConfig, SceneConfig
 
 CLOCK_NS = 2_500_000
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
@@ -96,59 +96,3 @@ def pendulum(
         "enable": "at-start",
     }
     return RobotConfig(**{**tables, **robot})
-
-
-FOUR_BAR = """
-<body name="hand" pos="0 0 .05625">
-  <inertial mass=".7" pos="0 0 .04" diaginertia=".0008 .0008 .0006"/>
-  <geom class="link" name="palm" type="box" size=".05 .03 .02" pos="0 0 .02"/>
-  <site name="tcp" pos="0 0 .13" size=".006"/>
-  {left}{right}
-</body>
-"""
-FOUR_BAR_FINGER = """
-<body name="crank_{side}" pos="0 {y}.02 .06">
-  <inertial mass=".03" pos="0 0 .025" diaginertia="1e-5 1e-5 1e-6"/>
-  <joint name="crank_{side}" axis="{x}1 0 0" range="-10 60" damping=".05" armature=".002"/>
-  <geom class="link" name="crank_{side}" type="capsule" fromto="0 0 0 0 0 .05" size=".003"/>
-  <body name="tip_{side}" pos="0 0 .05">
-    <inertial mass=".03" pos="0 0 .02" diaginertia="1e-5 1e-5 1e-6"/>
-    <joint name="tip_{side}" axis="{x}1 0 0" damping=".005" armature=".001"/>
-    <geom class="pad" name="pad_{side}" type="box" size=".012 .006 .03" pos="0 {back}.014 .02"/>
-  </body>
-</body>
-<body name="rod_{side}" pos="0 {y}.035 .06">
-  <inertial mass=".02" pos="0 0 .025" diaginertia="1e-5 1e-5 1e-6"/>
-  <joint name="rod_{side}" axis="{x}1 0 0" damping=".005" armature=".001"/>
-  <geom class="link" name="rod_{side}" type="capsule" fromto="0 0 0 0 0 .05" size=".003"/>
-</body>
-"""
-FOUR_BAR_EQUALITY = """
-<connect name="loop_left" body1="rod_left" body2="tip_left" anchor="0 0 .05" solref=".002 1" solimp=".99 .999 .001"/>
-<connect name="loop_right" body1="rod_right" body2="tip_right" anchor="0 0 .05" solref=".002 1" solimp=".99 .999 .001"/>
-<joint name="gear" joint1="crank_left" joint2="crank_right" solref=".002 1" solimp=".99 .999 .001"/>
-"""
-GRIPPER = {"actuator": "grip", "joint": "crank_left", "open": 0.6, "closed": 0.0, "force": 2.0}
-
-
-def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
-    """Write the PUMA with a gripper of closed loops to `folder`: a parallelogram a finger, two gears.
-
-    The cranks turn outwards by the opening, in rad; rods keep the tips parallel.
-    """
-    sides = [
-        FOUR_BAR_FINGER.format(side=side, y=y, back=back, x=x)
-        for side, y, back, x in (("left", "", "-", "-"), ("right", "-", "", ""))
-    ]
-    before, _, rest = (ROBOTS / "puma560.xml").read_text().partition('<body name="hand"')
-    text = before + FOUR_BAR.format(left=sides[0], right=sides[1]) + rest.split("</body>", 3)[3]
-    text = text.replace('<exclude body1="finger_left" body2="finger_right"/>', "")
-    head, equality = text.index("<equality>") + 10, text.index("</equality>")
-    text = text[:head] + FOUR_BAR_EQUALITY + text[equality:]
-    text = text.replace('name="grip" joint="finger_left"', 'name="grip" joint="crank_left"')
-    (folder / "puma560.xml").write_text(text)
-    cell_file = folder / "puma560_cell.xml"
-    cell_file.write_text((ROBOTS / "puma560_cell.xml").read_text())
-    robot, scene = config("puma560")
-    gripper = GripperConfig(**GRIPPER, stiffness=40.0, damping=1.0)
-    return robot.model_copy(update={"model": cell_file, "gripper": gripper}), scene

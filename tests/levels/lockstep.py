@@ -12,20 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import AnyMessage, Message
-from rack.levels.level import (
-    ConfiguredPorts,
-    Demand,
-    Executor,
-    InputPort,
-    LevelContext,
-    Pace,
-    Planner,
-    WrittenPort,
-)
-from rack.levels.operator import Goal, Operation, OperatorCommand
-from rack.levels.robot.cell import build_cell, compute_sizes
+from rack.levels.level import Demand, Executor, LevelContext, Pace, Planner, WrittenPort
+from rack.levels.operator import MAX_JOINTS, Goal, Operation, OperatorCommand
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
 
@@ -56,13 +49,16 @@ class Task:
         self.level, self.spec, self.due = level, spec, 0
         # A port that reads many has an input for each board, by (port, board).
         self._inputs: dict[str | tuple[str, str], Box] = {}
-        ports = {**level.inputs, **made_ports(spec, level).inputs}
+        is_executor = isinstance(level, Executor)
+        made = spec.executor.build_ports(spec.params, {}).inputs if is_executor else {}
+        ports = {**level.inputs, **made}
         self._many = [port for port, input_ in ports.items() if input_.many]
         self._tables = {port: level.find_input_table(port) for port in ports}
         for port, input_ in ports.items():
-            for name in sources(input_, spec):
-                key = (port, name.partition(".")[0]) if input_.many else port
-                self._inputs[key] = boxes[name]
+            place, _, rest = input_.source.partition(".")
+            neighbours = {"own": spec.name, "above": spec.above, "below": spec.below}
+            for board in listed(neighbours.get(place, place)):
+                self._inputs[(port, board) if input_.many else port] = boxes[f"{board}.{rest}"]
         self._values = {
             port: ports[port if isinstance(port, str) else port[0]].message(box.dtype)
             for port, box in self._inputs.items()
@@ -220,11 +216,24 @@ class Lockstep:
         """Make `message` visible in `mailbox` from now on."""
         self.boxes[mailbox].publish(message, self.tick)
 
+    def show(self, mailbox: str, **fields: object) -> None:
+        """Make a message with these fields visible in `mailbox` from now on."""
+        message = self.message(mailbox)
+        for name, value in fields.items():
+            setattr(message, name, value)
+        self.write(mailbox, message)
+
     def read(self, mailbox: str) -> AnyMessage:
         """Return a copy of the newest whole message that is visible now."""
         message = self.message(mailbox)
         message.raw[:] = self.boxes[mailbox].good_at(self.tick)
         return message
+
+    def show_start(self, cell: Cell, revision: int = 1) -> None:
+        """Have the world model show the objects of a cell where they are at the start."""
+        start = cell.build_start_data()
+        poses = {"position": start.xpos[cell.bodies], "quaternion": start.xquat[cell.bodies]}
+        self.show("world.model", revision=revision, **poses)
 
     def step(self) -> None:
         """Run every task that is released in the present tick."""
@@ -253,21 +262,8 @@ def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
     return boards if isinstance(boards, tuple) else (boards,) if boards else ()
 
 
-def made_ports(board: BoardSpec, level: Executor | Planner) -> ConfiguredPorts:
-    """Return the ports that the parameters of a board make; a planner has none."""
-    if not isinstance(level, Executor):
-        return ConfiguredPorts()
-    return board.executor.build_ports(board.params, {})
-
-
 def outputs_of(board: BoardSpec) -> dict[str, WrittenPort[Any, Any]]:
     return {**board.executor.outputs, **board.executor.build_ports(board.params, {}).outputs}
-
-
-def sources(port: InputPort[Any, Any], board: BoardSpec) -> list[str]:
-    place, _, rest = port.source.partition(".")
-    neighbours = {"own": board.name, "above": board.above, "below": board.below}
-    return [f"{name}.{rest}" for name in listed(neighbours.get(place, place))]
 
 
 class Operator:
@@ -280,35 +276,24 @@ class Operator:
         self, level: str, what: Operation, joints: Sequence[float] = (), goal: Goal = Goal.NONE
     ) -> int:
         """Give a command now, with `joints`, rad, as its goal if any; return its serial."""
-        message = self._message(level, what, Goal.JOINTS if len(joints) else goal)
-        message.count = len(joints)
-        message.joints[: len(joints)] = joints
-        self._rack.write(f"{level}.operator", message)
-        return self.serial
+        padded = np.pad(np.asarray(joints, float), (0, MAX_JOINTS - len(joints)))
+        form = Goal.JOINTS if len(joints) else goal
+        return self._send(level, what, form, count=len(joints), joints=padded)
 
     def goto(self, level: str, position: Sequence[float], direction: Sequence[float]) -> int:
         """Send the tool somewhere, m, with its z axis in a direction; return the serial."""
-        message = self._message(level, Operation.GOTO, Goal.DIRECTION)
-        message.position, message.direction = position, direction
-        self._rack.write(f"{level}.operator", message)
-        return self.serial
+        goal = {"position": position, "direction": direction}
+        return self._send(level, Operation.GOTO, Goal.DIRECTION, **goal)
 
     def modify(self, level: str, name: str, is_on: bool) -> int:
         """Put a control modification in now, or take it out; return the serial."""
-        message = self._message(level, Operation.MODIFY, Goal.ON if is_on else Goal.OFF)
-        message.name = name
-        self._rack.write(f"{level}.operator", message)
-        return self.serial
+        return self._send(level, Operation.MODIFY, Goal.ON if is_on else Goal.OFF, name=name)
 
     def set(self, level: str, setting: str) -> int:
         """Set a live parameter now; return the serial."""
-        message = self._message(level, Operation.SET, Goal.NONE)
-        message.name = setting
-        self._rack.write(f"{level}.operator", message)
-        return self.serial
+        return self._send(level, Operation.SET, Goal.NONE, name=setting)
 
-    def _message(self, level: str, what: Operation, goal: Goal) -> AnyMessage:
+    def _send(self, level: str, what: Operation, goal: Goal, **fields: Any) -> int:
         self.serial += 1
-        message = self._rack.message(f"{level}.operator")
-        message.id, message.what, message.goal = self.serial, what, goal
-        return message
+        self._rack.show(f"{level}.operator", id=self.serial, what=what, goal=goal, **fields)
+        return self.serial

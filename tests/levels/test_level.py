@@ -74,20 +74,6 @@ def test_the_public_api_does_not_import_mujoco() -> None:
     assert subprocess.run([sys.executable, "-c", code], timeout=30, check=False).returncode == 0
 
 
-@pytest.fixture
-def level() -> Answering:
-    context = cast(LevelContext, SimpleNamespace(sizes={}, params={"offset": 0.5}))
-    made = Answering(context)
-    made.store_output("status", AnswerStatus.zeros({}))
-    return made
-
-
-def operator_reading(serial: int, setting: str) -> Reading[OperatorCommand]:
-    message = OperatorCommand.zeros({})
-    message.id, message.what, message.name = serial, Operation.SET, setting
-    return Reading(message, Verdict.NEW)
-
-
 @pytest.mark.parametrize(
     ("setting", "why"),
     [
@@ -98,8 +84,12 @@ def operator_reading(serial: int, setting: str) -> Reading[OperatorCommand]:
         ("gian=1.0", "params.gian is not live; live: gain"),
     ],
 )
-def test_a_live_parameter_is_set_within_its_range(level: Answering, setting: str, why: str) -> None:
-    level.find_input_table("operator")["operator"] = operator_reading(1, setting)
+def test_a_live_parameter_is_set_within_its_range(setting: str, why: str) -> None:
+    level = Answering(cast(LevelContext, SimpleNamespace(sizes={}, params={"offset": 0.5})))
+    level.store_output("status", AnswerStatus.zeros({}))
+    message = OperatorCommand.zeros({})
+    message.id, message.what, message.name = 1, Operation.SET, setting
+    level.find_input_table("operator")["operator"] = Reading(message, Verdict.NEW)
     level.take_settings(0)
     assert (level.settings.gain, level.settings.offset) == (2.0 if why else 3.5, 0.5)
     status = level.status

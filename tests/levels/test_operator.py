@@ -174,15 +174,11 @@ ASIDE = [0.45, 0.25, 0.90]
 DOWN = [0.0, 0.0, -1.0]
 
 
-def is_under_way(rack: WholeRack) -> bool:
-    return bool(np.abs(rack.read("servo.status").target_velocity).max() > 0.1)
-
-
 def start_tour(actions: Sequence[Mapping[str, Any]] = TOUR) -> tuple[WholeRack, Operator]:
     """Return a rack whose arm is under way, and its operator."""
     rack = WholeRack(actions=actions)
     operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    assert rack.run(10.0, lambda r: np.abs(r.read("servo.status").target_velocity).max() > 0.1)
     return rack, operator
 
 
@@ -194,7 +190,6 @@ def has_answer(level: str, answer: Answer, serial: int) -> Callable[[WholeRack],
     return is_it
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
     rack, operator = start_tour([REACH, HOME])

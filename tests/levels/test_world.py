@@ -39,9 +39,8 @@ class WorldRig:
         revisions = [self.model.revision]
         for _ in range(round(seconds / TICK_S)):
             if poses is not None:
-                scene = self.rack.message("servo.scene")
-                scene.position, scene.quaternion = poses(self.rack.tick * TICK_S)
-                self.rack.write("servo.scene", scene)
+                position, quaternion = poses(self.rack.tick * TICK_S)
+                self.rack.show("servo.scene", position=position, quaternion=quaternion)
             self.rack.step()
             if self.model.revision != revisions[-1]:
                 revisions.append(self.model.revision)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from typing import Any
 
 from rack.backplane.message import Message, State
 from rack.boards.config import RackConfig, load
+from rack.levels.level import Executor, Planner
+from rack.levels.references import find_class
 from rack.levels.tables import MotionConfig, RobotConfig, SceneConfig
 from tests.levels.arms import config as arm_config
 from tests.levels.lockstep import BoardSpec, Lockstep
@@ -57,16 +58,10 @@ def board(config: RackConfig, name: str, params: Mapping[str, Any]) -> BoardSpec
     return BoardSpec(
         name=name,
         every=config.find_period(name),
-        executor=named(table.executor),
-        planner=named(table.planner) if table.planner is not None else None,
+        executor=find_class(table.executor, Executor),
+        planner=find_class(table.planner, Planner) if table.planner is not None else None,
         within_cycles=table.within_cycles,
         above="".join(table.above),
         below="".join(table.below),
         params={**table.params, **params},
     )
-
-
-def named(place: str) -> Any:
-    """Return the class at "package.module:Class"."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import time
+from contextlib import ExitStack
+from functools import partial
 from types import SimpleNamespace
 from typing import get_args
 
@@ -21,7 +22,7 @@ from rack.backplane.semaphores import get_done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread
+from tests.processes import FORKS, forked, in_thread
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
@@ -55,21 +56,14 @@ def lockstep(
 
     segment.words[System.LOCKSTEP] = 1
     # Ready before the first release: a task that is late waits for the next one.
-    cycles = {t.name: NextCycle(segment, t.name) for t in segment.layout.tasks}
-    threads = [
-        threading.Thread(
-            target=serve, args=(segment, t.name, cycles[t.name], log, 0.002 * t.slot), daemon=True
-        )
-        for t in segment.layout.tasks
-    ]
-    for thread in threads:
-        thread.start()
+    cycles = {t: NextCycle(segment, t.name) for t in segment.layout.tasks}
     driver = LockstepDriver(segment, ended, one_at_a_time, HISTORY)
     driver.is_flooded = flooded
-    driver.run()
-    for thread in threads:
-        thread.join(BOUND_S)
-        assert not thread.is_alive()
+    with ExitStack() as served:
+        for t, cycle in cycles.items():
+            work = partial(serve, segment, t.name, cycle, log, 0.002 * t.slot)
+            served.enter_context(in_thread(work))
+        driver.run()
     return log, ticks
 
 
@@ -188,23 +182,11 @@ def test_the_lead_of_the_clock_over_its_recorder_is_bounded(
     assert driver._is_recorder_behind(ticks) is is_ahead
 
 
-class Idle:
-    """A system controller without work before a tick."""
-
-    def __init__(self, until: int = sys.maxsize) -> None:
-        self.begun: list[int] = []
-        self._until = until
-
-    def begin_tick(self, tick: int) -> None:
-        """Note that the clock works at a tick."""
-        self.begun.append(tick)
-
-    def finish_release(self, tick: int) -> None:
-        """Do nothing."""
-
-    def find_next_work_tick(self, tick: int) -> int:
-        """Return the tick with work."""
-        return self._until
+def idle_driver(segment: Segment, until: int = sys.maxsize) -> LockstepDriver:
+    """Return a driver whose controller has no work before a tick."""
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    driver.controller = SimpleNamespace(find_next_work_tick=lambda tick: until)
+    return driver
 
 
 def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus) -> None:
@@ -213,13 +195,18 @@ def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus)
     log: list[tuple[str, str, int]] = []
     cycles = {name: NextCycle(segment, name) for name in ("fast", "slow")}
     driver = LockstepDriver(segment, lambda tick: 15, False, HISTORY)
-    controller = driver.controller = Idle()
+    worked_at = list[int]()
+    driver.controller = SimpleNamespace(
+        begin_tick=worked_at.append,
+        finish_release=id,
+        find_next_work_tick=lambda tick: sys.maxsize,
+    )
     with (
         in_thread(lambda: serve(segment, "fast", cycles["fast"], log, 0.0)),
         in_thread(lambda: serve(segment, "slow", cycles["slow"], log, 0.02)),
     ):
         driver.run()
-    assert controller.begun == [0, 1, 6, 7, 12, 13]
+    assert worked_at == [0, 1, 6, 7, 12, 13]
     begun = {
         name: [at for what, who, at in log if (what, who) == ("begin", name)] for name in cycles
     }
@@ -244,8 +231,7 @@ def test_a_batch_ends_at_the_end_of_the_run_or_at_a_hold(
     make_bus: MakeBus, word: int, value: int, end: int
 ) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    driver.controller = Idle()
+    driver = idle_driver(segment)
     driver._wait_for_tick(0)
     segment.words[word] = value
     assert driver._find_batch_end(driver.list_due_tasks(1, 0), 1) == end
@@ -256,8 +242,7 @@ def test_a_batch_ends_before_the_next_work_of_the_clock_or_the_next_snapshot(
     make_bus: MakeBus, snapshot_at: int, end: int
 ) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    driver.controller = Idle(until=7)
+    driver = idle_driver(segment, until=7)
     called_at = []
 
     def snapshot(tick: int) -> int:
@@ -277,8 +262,7 @@ def test_a_planner_several_tasks_and_one_that_is_stopped_get_one_tick_each(
 ) -> None:
     planner = task("planner", slot=4, role="planner")
     segment = make_bus(task("fast", slot=2), task("also", every=2, slot=3), planner)
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    driver.controller = Idle()
+    driver = idle_driver(segment)
     driver._wait_for_tick(0)
     assert driver._find_batch_end(driver.list_due_tasks(2, 1), 2) == 3
     assert driver._find_batch_end([], 1) == 2

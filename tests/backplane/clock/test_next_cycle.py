@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from dataclasses import replace
 from typing import get_args
@@ -20,7 +19,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
+from tests.processes import FORKS, forked, in_thread, wait_until
 
 WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
@@ -131,13 +130,9 @@ def test_a_restarted_task_waits_for_the_next_release_and_has_skipped_those_witho
 @WAKES
 def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     found: list[int | None] = [-1]
-    thread = threading.Thread(
-        target=lambda: found.append(NextCycle(bus, "level").wait()), daemon=True
-    )
-    thread.start()
-    bus.words[System.STATE] = Run.STOPPED
-    get_wake_semaphore(bus, "level").release()
-    thread.join(BOUND_S)
+    with in_thread(lambda: found.append(NextCycle(bus, "level").wait())):
+        bus.words[System.STATE] = Run.STOPPED
+        get_wake_semaphore(bus, "level").release()
     assert found == [-1, None]
 
 
@@ -252,10 +247,8 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
 @pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
     start_grid(bus)
-    cycle, ring = (
-        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
-        open_alarm_ring(bus, "level"),
-    )
+    cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
+    ring = open_alarm_ring(bus, "level")
     release(bus, 0)
     cycle.wait()
     with forked(signal.pause) as pid:

@@ -7,8 +7,6 @@ from dataclasses import replace
 import pytest
 
 from rack.backplane.clock.released_task import ReleasedTask, sort_by_priority
-from rack.backplane.layout import TaskSpec
-from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from tests.backplane.bus import layout, task
 from tests.backplane.conftest import MakeBus
@@ -17,18 +15,9 @@ EVERY, PHASE = 4, 1
 
 
 @pytest.fixture
-def spec() -> TaskSpec:
-    return replace(task("level", every=EVERY), phase=PHASE)
-
-
-@pytest.fixture
-def bus(make_bus: MakeBus, spec: TaskSpec) -> Segment:
-    return make_bus(task("first"), spec)
-
-
-@pytest.fixture
-def released(bus: Segment, spec: TaskSpec) -> ReleasedTask:
-    return ReleasedTask(bus, spec)
+def released(make_bus: MakeBus) -> ReleasedTask:
+    spec = replace(task("level", every=EVERY), phase=PHASE)
+    return ReleasedTask(make_bus(task("first"), spec), spec)
 
 
 def words(found: ReleasedTask) -> tuple[int, int, int]:

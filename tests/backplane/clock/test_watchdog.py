@@ -9,13 +9,14 @@ import time
 import pytest
 
 from rack.backplane.clock.released_task import MIN_HANG_NS, RELEASES_MISSED, ReleasedTask, Watchdog
-from rack.backplane.process import read_state
+from rack.backplane.process import busy_wait_until, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Block, TaskState
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until
 
+pytestmark = pytest.mark.filterwarnings(FORKS)
 PERIOD_NS = 2_500_000
 
 
@@ -26,7 +27,7 @@ class Watched:
         self.task = ReleasedTask(segment, segment.layout.find_task("writer"))
         self.task.block[Block.PID] = pid
         self.task.block[Block.STATE] = TaskState.RUNNING
-        self._watchdog = Watchdog(AlarmWriter(segment, "clock"), PERIOD_NS)
+        self.watchdog = Watchdog(AlarmWriter(segment, "clock"), PERIOD_NS)
         self._ring = open_alarm_ring(segment, "clock")
         self.tick = -1
 
@@ -37,13 +38,8 @@ class Watched:
             self.task.block[Block.DONE] = self.task.block[Block.RELEASED]
         self.task.release(self.tick)
         if self.task.missed:
-            self._watchdog.check(self.task, self.tick)
+            self.watchdog.check(self.task, self.tick)
         return [Alarm(code) for code in self._ring.read_new_rows().rows["code"]]
-
-    @property
-    def losses(self) -> int:
-        """Tasks that were found hanging."""
-        return self._watchdog.losses
 
 
 def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
@@ -60,7 +56,7 @@ def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> 
     rung = [watched.release(False) for _ in range(3 * RELEASES_MISSED)]
     assert [alarms for alarms in rung if alarms] == [[Alarm.LATE], [Alarm.STARVED]]
     assert rung[RELEASES_MISSED - 1] == [Alarm.STARVED]
-    assert (watched.losses, watched.task.lost_tick) == (0, -1)
+    assert (watched.watchdog.losses, watched.task.lost_tick) == (0, -1)
 
 
 def silent(watched: Watched) -> list[Alarm]:
@@ -70,13 +66,6 @@ def silent(watched: Watched) -> list[Alarm]:
     return watched.release(False)
 
 
-def burn(seconds: float) -> None:
-    end = time.process_time() + seconds
-    while time.process_time() < end:
-        pass
-
-
-@pytest.mark.filterwarnings(FORKS)
 def test_a_process_that_waits_for_something_else_is_lost_in_the_end(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
@@ -101,11 +90,10 @@ def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     watched.release(True)
     rung = [watched.release(False) for _ in range(5 * RELEASES_MISSED)]
     assert not any(Alarm.HANG in alarms for alarms in rung)
-    burn(0.1)
+    busy_wait_until(time.process_time_ns() + 100_000_000)
     assert watched.release(False) == [Alarm.HANG]
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
@@ -115,7 +103,7 @@ def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> Non
         wait_until(lambda: read_state(pid) == "T")
         rung = [watched.release(False) for _ in range(RELEASES_MISSED)]
     assert rung == [[Alarm.LATE], [], [], [Alarm.HANG]]
-    assert watched.losses == 1
+    assert watched.watchdog.losses == 1
     assert not watched.task.can_take_release(watched.tick + 1)
 
 
@@ -128,4 +116,4 @@ def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus
         # It finishes the release before this one meanwhile.
         watched.task.block[Block.DONE] = tick - 1
     assert rung == [Alarm.LATE]
-    assert watched.losses == 0
+    assert watched.watchdog.losses == 0

@@ -13,7 +13,7 @@ from tests.boards.run.test_exchange import TEXT as EXCHANGE
 from tests.snapshots import Snapshots
 from tests.whole_runs import in_short, whole_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 SNAPSHOTS = Snapshots(__file__)
 SECONDS = 1.5
 RACKS: dict[str, tuple[str, tuple[str, ...]]] = {

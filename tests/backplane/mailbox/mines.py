@@ -26,40 +26,30 @@ class Bomb:
         self.left -= 1
 
 
-class MinedBox:
-    """Words in shared memory, each store of which counts."""
+class Mined:
+    """Shared memory, each store to which counts; of a slice, every word is stored alone."""
 
-    def __init__(self, words: memoryview, bomb: Bomb) -> None:
-        self._words, self._bomb = words, bomb
+    def __init__(self, memory: memoryview, bomb: Bomb) -> None:
+        self._memory, self._bomb = memory, bomb
 
     def __getitem__(self, at: Any) -> Any:
-        return self._words[at]
+        return self._memory[at]
 
-    def __setitem__(self, at: int, value: int) -> None:
-        self._bomb.count()
-        self._words[at] = value
-
-
-class MinedSlot:
-    """A slot into which every word is stored alone, in an order of the bomb's choice."""
-
-    def __init__(self, place: memoryview, bomb: Bomb) -> None:
-        self._place, self._bomb = place, bomb
-
-    def __getitem__(self, part: slice) -> memoryview:
-        return self._place[part]
-
-    def __setitem__(self, part: slice, content: Any) -> None:
-        view = self._place[part]
-        for at in range(0, len(view), 8):
+    def __setitem__(self, at: int | slice, value: Any) -> None:
+        if isinstance(at, int):
             self._bomb.count()
-            view[at : at + 8] = content[at : at + 8]
+            self._memory[at] = value
+            return
+        view = self._memory[at]
+        for start in range(0, len(view), 8):
+            self._bomb.count()
+            view[start : start + 8] = value[start : start + 8]
 
 
 def mine(writer: Writer, bomb: Bomb) -> None:
     """Let every store of a writer to shared memory count."""
     slots: Any = writer.slots
-    slots.box = MinedBox(slots.box, bomb)
-    writer.claim._box = MinedBox(writer.claim._box, bomb)  # type: ignore[assignment]
-    slots.places = [MinedSlot(place, bomb) for place in slots.places]
-    slots.heads = [MinedBox(words, bomb) for words in slots.heads]
+    slots.box = Mined(slots.box, bomb)
+    writer.claim._box = Mined(writer.claim._box, bomb)  # type: ignore[assignment]
+    slots.places = [Mined(place, bomb) for place in slots.places]
+    slots.heads = [Mined(words, bomb) for words in slots.heads]

@@ -90,7 +90,7 @@ class Setup:
         waits: True if a reader waits while its slot is being filled.
     """
 
-    memory: Memory
+    memory: Memory = Memory.SC
     depth: int = 4
     published: int = 3
     messages: int = 5

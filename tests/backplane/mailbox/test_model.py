@@ -14,7 +14,6 @@ from tests.backplane.mailbox.model import (
     PUBLISH,
     READ,
     TAKE_OVER,
-    Exploration,
     Memory,
     Setup,
     explore,
@@ -44,89 +43,59 @@ MESSAGES = {Memory.SC: 3, Memory.TSO: 1, Memory.WEAK: 2}
 LARGEST = (Memory.TSO, "two take-overs and a kill")
 """Has so many states that it is tried under `EXHAUSTIVE` only. Its parts are always tried."""
 STOPPED: dict[str, Any] = {"kills": 0, "stops": 1, "words": COARSE, "claim": TAKE_OVER}
+WEAK = {"memory": Memory.WEAK}
 NOT_PUBLISHED = "a reader returns a message that was not published"
 NOT_BAD = "a reader takes a published message for a bad one"
 TWO_OF_ONE_SERIAL = "two messages of one serial are published"
 NO_CLAIM = "a message is published without the valid claim"
-WAITS = "a reader waits"
 MUTANTS: dict[str, tuple[dict[str, Any], str]] = {
-    "head before slot": (
-        {"memory": Memory.SC, "publish": (*PUBLISH[:1], PUBLISH[-1], *PUBLISH[1:-2])},
-        NOT_BAD,
-    ),
-    "no checksum": ({"memory": Memory.SC, "is_checked": False}, NOT_PUBLISHED),
-    "no epoch": ({"memory": Memory.SC, "is_claimed": False, "forgeries": 1}, NOT_PUBLISHED),
-    "relaxed store of the head": (
-        {"memory": Memory.WEAK, "publish": (*PUBLISH[:-2], PUBLISH[-1])},
-        NOT_BAD,
-    ),
-    "relaxed load of the head": ({"memory": Memory.WEAK, "read": (READ[0], *READ[2:])}, NOT_BAD),
-    "no fence before a slot is filled": ({"memory": Memory.WEAK, "publish": PUBLISH[1:]}, NOT_BAD),
-    "no fence before a copy is judged": ({"memory": Memory.WEAK, "judge": JUDGE[1:]}, NOT_BAD),
+    "head before slot": ({"publish": (*PUBLISH[:1], PUBLISH[-1], *PUBLISH[1:-2])}, NOT_BAD),
+    "no checksum": ({"is_checked": False}, NOT_PUBLISHED),
+    "no epoch": ({"is_claimed": False, "forgeries": 1}, NOT_PUBLISHED),
+    "relaxed store of the head": ({**WEAK, "publish": (*PUBLISH[:-2], PUBLISH[-1])}, NOT_BAD),
+    "relaxed load of the head": ({**WEAK, "read": (READ[0], *READ[2:])}, NOT_BAD),
+    "no fence before a slot is filled": ({**WEAK, "publish": PUBLISH[1:]}, NOT_BAD),
+    "no fence before a copy is judged": ({**WEAK, "judge": JUDGE[1:]}, NOT_BAD),
     "claim after publication": (
-        {
-            "memory": Memory.SC,
-            "claim": (*CLAIM[:2], CLAIM[3]),
-            "publish": (*PUBLISH, CLAIM[2]),
-        },
+        {"claim": (*CLAIM[:2], CLAIM[3]), "publish": (*PUBLISH, CLAIM[2])},
         NO_CLAIM,
     ),
-    "claim without the kernel's lock": ({"memory": Memory.SC, "is_locked": False}, NO_CLAIM),
+    "claim without the kernel's lock": ({"is_locked": False}, NO_CLAIM),
     "slots of a dead writer left filled": (
         # Bounds of serials protect from this too.
-        {"memory": Memory.SC, "claim": CLAIM[:3], "losses": 1, "is_bounded": False},
+        {"claim": CLAIM[:3], "losses": 1, "is_bounded": False},
         NOT_PUBLISHED,
     ),
     "signature before message": (
         {
-            "memory": Memory.SC,
             "publish": (PUBLISH[0], PUBLISH[3], PUBLISH[2], PUBLISH[1], *PUBLISH[4:]),
             "forgeries": 1,
         },
         NOT_PUBLISHED,
     ),
     "signature loaded after the message": (
-        {"memory": Memory.SC, "read": (*READ[:2], *READ[:1:-1]), "forgeries": 1},
+        {"read": (*READ[:2], *READ[:1:-1]), "forgeries": 1},
         NOT_PUBLISHED,
     ),
-    "message of a stopped writer accepted": (
-        {"memory": Memory.SC, **STOPPED, "is_bounded": False},
-        NOT_PUBLISHED,
-    ),
-    "checksum without the epoch": (
-        {"memory": Memory.SC, **STOPPED, "is_bound": False},
-        NOT_PUBLISHED,
-    ),
-    "claim not loaded for a known writer": (
-        {"memory": Memory.SC, **STOPPED, "is_claim_loaded": False},
-        NOT_PUBLISHED,
-    ),
-    "head not loaded again after the claim": (
-        {"memory": Memory.SC, **STOPPED, "claim": CLAIM},
-        TWO_OF_ONE_SERIAL,
-    ),
+    "message of a stopped writer accepted": ({**STOPPED, "is_bounded": False}, NOT_PUBLISHED),
+    "checksum without the epoch": ({**STOPPED, "is_bound": False}, NOT_PUBLISHED),
+    "claim not loaded for a known writer": ({**STOPPED, "is_claim_loaded": False}, NOT_PUBLISHED),
+    "head not loaded again after the claim": ({**STOPPED, "claim": CLAIM}, TWO_OF_ONE_SERIAL),
     "relaxed load of the claim": (
-        {"memory": Memory.WEAK, **STOPPED, "stops": 2, "messages": 1, "read": (*READ[:5], READ[6])},
+        {**WEAK, **STOPPED, "stops": 2, "messages": 1, "read": (*READ[:5], READ[6])},
         NOT_PUBLISHED,
     ),
-    "claim before its bound": (
-        {"memory": Memory.SC, "claim": (CLAIM[2], *CLAIM[1:2], CLAIM[0], CLAIM[3])},
-        NOT_BAD,
-    ),
-    "reader waits for a slot being filled": ({"memory": Memory.SC, "waits": True}, WAITS),
+    "claim before its bound": ({"claim": (CLAIM[2], *CLAIM[1:2], CLAIM[0], CLAIM[3])}, NOT_BAD),
+    "reader waits for a slot being filled": ({"waits": True}, "a reader waits"),
 }
 """Mistakes in the protocol, and what each violates."""
-
-
-def found(**settings: Any) -> Exploration:
-    return explore(Setup(**settings))
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("memory", Memory)
 def test_the_protocol_holds_in_every_state(memory: Memory, case: str) -> None:
-    exploration = found(memory=memory, **CASES[case])
+    exploration = explore(Setup(memory=memory, **CASES[case]))
     assert (exploration.violation, exploration.steps) == ("", ())
     assert exploration.states > 5_000
 
@@ -141,32 +110,27 @@ def test_the_protocol_holds_in_every_state_of_a_take_over(memory: Memory, case: 
     # Two stopped writers have many more states.
     messages = MESSAGES[memory] if settings["stops"] == 1 else 1
     settings |= {"messages": messages, "words": COARSE, "claim": TAKE_OVER}
-    exploration = found(memory=memory, **settings)
+    exploration = explore(Setup(memory=memory, **settings))
     assert (exploration.violation, exploration.steps) == ("", ())
     assert exploration.states > 1_000
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_on_x86_it_holds_without_fences() -> None:
     """Plain loads and stores are enough there: those of Python are such."""
-    plain = {
+    fenced = {"publish": PUBLISH, "lose": LOSE, "read": READ, "judge": JUDGE}
+    plain: dict[str, Any] = {
         name: tuple(access for access in accesses if access != "fence")
-        for name, accesses in (
-            ("publish", PUBLISH),
-            ("lose", LOSE),
-            ("read", READ),
-            ("judge", JUDGE),
-        )
+        for name, accesses in fenced.items()
     }
-    assert not found(memory=Memory.TSO, words=COARSE, **plain).violation
-    assert found(memory=Memory.WEAK, words=COARSE, **plain).violation
+    assert not explore(Setup(memory=Memory.TSO, words=COARSE, **plain)).violation
+    assert explore(Setup(memory=Memory.WEAK, words=COARSE, **plain)).violation
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mistake", MUTANTS)
 def test_a_mistake_in_the_protocol_is_found(mistake: str) -> None:
     settings, violation = MUTANTS[mistake]
-    exploration = found(**settings)
+    exploration = explore(Setup(**settings))
     assert exploration.violation == violation, exploration.steps
     assert exploration.steps

@@ -7,8 +7,6 @@ and the writer goes on meanwhile, up to the middle of a message.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -39,39 +37,6 @@ FAULTS = {
 """Kinds of fault, and the alarms that a reader may raise for each."""
 
 
-class Interruption:
-    """Counts executed instructions of `backplane`, and calls `action` before number `at`."""
-
-    def __init__(self, at: int, action: Callable[[], None]) -> None:
-        self._left, self._action = at, action
-
-    @property
-    def has_come(self) -> bool:
-        """Whether there were that many instructions."""
-        return self._left < 0
-
-    @contextmanager
-    def armed(self) -> Iterator[None]:
-        """Count in this block."""
-        before = sys.gettrace()
-        sys.settrace(self._trace)
-        try:
-            yield
-        finally:
-            sys.settrace(before)
-
-    def _trace(self, frame: FrameType, event: str, _: object) -> Any:
-        if not frame.f_code.co_filename.startswith(CODE):
-            return None
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        if event == "opcode":
-            self._left -= 1
-            if self._left == -1:
-                # The writer's code is not counted: tracing is off here.
-                self._action()
-        return self._trace
-
-
 class Overtaken:
     """A link whose writer overtakes its reader in the middle of a read."""
 
@@ -88,18 +53,31 @@ class Overtaken:
         self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
 
     def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:
-        """Read, and run the writer's cycles before that instruction; False if the read has fewer
-        instructions."""
+        """Read, and run the writer's cycles before that instruction of `backplane`; False if the
+        read has fewer instructions."""
+        left = at
 
-        def overtake() -> None:
-            self.write(cycles)
-            if stops_halfway:
-                self._write_half()
+        def trace(frame: FrameType, event: str, _: object) -> Any:
+            nonlocal left
+            if not frame.f_code.co_filename.startswith(CODE):
+                return None
+            frame.f_trace_opcodes, frame.f_trace_lines = True, False
+            if event == "opcode":
+                left -= 1
+                if left == -1:
+                    # The writer's code is not counted: tracing is off here.
+                    self.write(cycles)
+                    if stops_halfway:
+                        self._write_half()
+            return trace
 
-        interruption = Interruption(at, overtake)
-        with interruption.armed():
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
             self.read()
-        return interruption.has_come
+        finally:
+            sys.settrace(before)
+        return left < 0
 
     def _write_half(self) -> None:
         """Leave the writer in the middle of the copy of one more message into its slot."""

@@ -86,8 +86,7 @@ def test_messages_of_a_cycle_are_published_together_or_not_at_all(make_bus: Make
     segment = make_bus(*queue(8))
 
     def die() -> None:
-        writer = open_writer(segment, NAME)
-        assert isinstance(writer, QueueWriter)
+        writer = QueueWriter(segment, NAME)
         send(writer, 0, 1, 2)
         for serial in (3, 4):
             queue_message(writer, serial)
@@ -125,8 +124,8 @@ def test_an_observer_takes_no_message_from_a_queue(make_bus: MakeBus) -> None:
     reader.take_messages(2, 1)
     reader.close()
     # A restarted reader still has the last message taken as an old one.
-    _, reader = writer.close(), open_reader(segment, NAME)
-    assert isinstance(reader, QueueReader)
+    writer.close()
+    reader = QueueReader(segment, NAME)
     again = reader.take_messages(3, 0)
     assert (again.verdict, again.message.id) == (Verdict.OLD, 3)
     # Its position counts the messages left.
@@ -165,14 +164,6 @@ def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: int, at
     assert ids(reader.read(2)) == [4]
 
 
-def take_three(segment: Segment) -> None:
-    """Take messages 1 and 2 in one cycle and 3 in the next, as a reader that is then killed."""
-    reader = open_reader(segment, NAME)
-    assert isinstance(reader, QueueReader)
-    assert [ids(reader.take_messages(1, 2)), ids(reader.take_messages(2, 1))] == [[1, 2], [3]]
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def bookkeeping(segment: Segment) -> Iterator[int]:
     """Yield the addresses of the heads of a queue, of its position, and of the slots in use of
     both."""
@@ -193,17 +184,20 @@ def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(
     make_bus: MakeBus, step: int
 ) -> None:
     segment = make_bus(*queue(8))
-    writer = open_writer(segment, NAME)
-    assert isinstance(writer, QueueWriter)
-    send(writer, 0, 1, 2, 3, 4, 5)
-    assert exit_status(fork(lambda: take_three(segment))) == -signal.SIGKILL
+    send(QueueWriter(segment, NAME), 0, 1, 2, 3, 4, 5)
+
+    def take_three() -> None:
+        reader = QueueReader(segment, NAME)
+        assert [ids(reader.take_messages(1, 2)), ids(reader.take_messages(2, 1))] == [[1, 2], [3]]
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    assert exit_status(fork(take_three)) == -signal.SIGKILL
     before = bytes(segment.bytes)
     bits = [(address, bit) for address in bookkeeping(segment) for bit in range(8)]
     for address, bit in bits[::step]:
         segment.bytes[:] = before
         segment.bytes[address] ^= 1 << bit
-        reader = open_reader(segment, NAME)
-        assert isinstance(reader, QueueReader)
+        reader = QueueReader(segment, NAME)
         found = [*ids(reader.take_messages(3, 1)), *ids(reader.read(4))]
         damaged, counted = f"bit {bit} at {address}", reader.statistics.bad_reads
         reader.close()

@@ -14,6 +14,7 @@ from tests.backplane.conftest import MakeBus
 from tests.backplane.mailbox.mines import Bomb, mine
 from tests.processes import FORKS, exit_status, fork
 
+pytestmark = pytest.mark.filterwarnings(FORKS)
 NEW, OLD = Verdict.NEW, Verdict.OLD
 
 
@@ -136,7 +137,6 @@ def test_a_head_that_a_stopped_writer_has_set_back_loses_no_message(
     assert reader.serial == 8 + is_written_again
 
 
-@pytest.mark.filterwarnings(FORKS)
 def test_a_standby_that_dies_in_its_claim_takes_no_message_from_the_active_copy(
     make_bus: MakeBus,
 ) -> None:
@@ -166,7 +166,6 @@ def test_a_standby_that_dies_in_its_claim_takes_no_message_from_the_active_copy(
 MOST_STORES = 100
 
 
-@pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize(
     "is_stopped", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["dead", "stopped"]
 )

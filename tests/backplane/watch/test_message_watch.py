@@ -27,8 +27,7 @@ def test_a_reader_that_skips_cycles_reports_nothing_false(
     for pause in (1, 2, 18, 100):
         start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
         rack.run(start, start + 30)
-        for tick in range(start + 30, start + 30 + pause):
-            rack.writer.cycle(tick)
+        rack.run(start + 30, start + 30 + pause, reads=False)
         rack.run(start + 30 + pause, start + 60 + pause)
     assert rack.alarms() == []
     assert not any(seen.is_lost for seen in rack.reader.seen)
@@ -41,8 +40,7 @@ def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(
 ) -> None:
     rack = link(protocol)
     rack.run(0, 20)
-    for tick in range(20, 20 + late):
-        rack.reader.cycle(tick)
+    rack.run(20, 20 + late, writes=False)
     # Released at 20, finished at 20 + late: the releases in between are skipped.
     rack.writer.cycle(20, now=20 + late)
     rack.run(20 + late, 80)
@@ -53,8 +51,7 @@ def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(
 def test_a_restarted_reader_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)
     rack.run(0, 50)
-    for tick in range(50, 450):
-        rack.writer.cycle(tick)
+    rack.run(50, 450, reads=False)
     rack.reader = ReadingTask(rack.segment)
     rack.run(450, 500)
     assert rack.alarms() == []
@@ -72,9 +69,7 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(
         # Killed after its write, before the end of its cycle.
         publish(rack, 50, 51)
     rack.writer.close()
-    rack.reader.cycle(50)
-    for tick in range(51, 250):
-        rack.reader.cycle(tick)
+    rack.run(50, 250, writes=False)
     rack.writer = WritingTask(rack.segment)
     rack.run(250, 300)
     assert rack.alarms() == []

@@ -15,10 +15,8 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config, save_state
 
-Torque = Callable[[], Array]
 
-
-def build_moving_arm(every: int = 1) -> tuple[SimulatedArm, Cell, Torque]:
+def build_moving_arm(every: int = 1) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:
     """Return an arm under way, and torques that would keep it under way."""
     made = cell("puma560")
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

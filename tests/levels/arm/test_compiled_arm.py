@@ -11,7 +11,6 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels import arm as arm_package
-from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, drives, sensors, substeps
 from rack.levels.compiled import compiled
 from rack.levels.messages import Scene
@@ -19,7 +18,8 @@ from rack.levels.robot import dynamics
 from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.robot.limits import Encoders
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar, save_state
+from tests.levels.arms import CLOCK_NS, cell, config, save_state
+from tests.levels.robot.grippers import four_bar
 
 RNG = np.random.default_rng(8)
 OFFSET = np.array([0.02, -0.03, 0.05])
@@ -41,19 +41,15 @@ def scene(arm: SimulatedArm, made: Cell) -> Message:
     return seen
 
 
-def use_python(arm: SimulatedArm) -> None:
-    """Replace an arm's compiled functions by their Python."""
-    arm._advance, arm._copy_state = substeps.make_steps, substeps.copy_state
-    arm._gate._is_clear = drives.is_clear
-    arm.dynamics._evaluate, arm.dynamics._carry = dynamics.evaluate_terms, dynamics.add_payload
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["puma560", "k1607", "puma560_crossing"])
 def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
     made = cell(name)
     one, other = (SimulatedArm(made, config(name)[1], CLOCK_NS) for _ in range(2))
-    use_python(other)
+    other._advance, other._copy_state = substeps.make_steps, substeps.copy_state
+    other._gate._is_clear = drives.is_clear
+    other.dynamics._evaluate = dynamics.evaluate_terms
+    other.dynamics._carry = dynamics.add_payload
     assert drive_cycles(one, made, 300).raw == drive_cycles(other, made, 300).raw
     assert one.touches == other.touches
     assert scene(one, made).raw == scene(other, made).raw
@@ -85,13 +81,6 @@ def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
         assert np.array_equal(one, other)
 
 
-def draw_samples(tick: int) -> Array:
-    """Return the noise of a tick in standard deviations, (2, joints)."""
-    encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
-    sample = sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick)
-    return sample / [[1e-3], [1e-2]]
-
-
 def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> None:
     arm_package.preload()
     four = four_bar(tmp_path)
@@ -104,7 +93,8 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
         arm.brake()
         arm.step(2)
         scene(arm, made)
-    draw_samples(1)
+    encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
+    sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), 1)
     functions: list[compiled[..., Any]] = [
         *(dynamics.evaluate_terms, dynamics.add_payload, substeps.make_steps, substeps.copy_state),
         *(drives.is_clear, sensors.sense_coarsely),

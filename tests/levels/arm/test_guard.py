@@ -12,7 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.config import load, resolve_layout
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array
-from rack.levels.arm import Arm, Sensed
+from rack.levels.arm import Sensed
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
@@ -51,17 +51,15 @@ class CoarseArm(IdealArm):
         return sample._replace(position=sample.position + q, velocity=sample.velocity + qd)
 
 
-def drive_cycles(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
+def drive_cycles(guard: GuardedArm, arm: IdealArm, torques: Iterator[Array]) -> tuple[Array, Array]:
     """Drive an arm cycle by cycle; return the positions, and the velocities, that it had."""
     arm.enable()
     true = []
     for torque in torques:
-        link.sense()
-        link.drive(torque, 0.0)
+        guard.sense()
+        guard.drive(torque, 0.0)
         arm.step(1)
-        state = arm.drives if hasattr(arm, "drives") else arm
-        q, qd = ("position", "velocity") if hasattr(arm, "drives") else ("_q", "_qd")
-        true.append((getattr(state, q).copy(), getattr(state, qd).copy()))
+        true.append((arm._q.copy(), arm._qd.copy()))
     return np.array([q for q, _ in true]), np.array([qd for _, qd in true])
 
 
@@ -83,10 +81,6 @@ def random_torques(cell: Cell, seed: int, cycles: int) -> Iterator[Array]:
         yield torque
 
 
-def own_cell(folder: Path) -> Cell:
-    return build_cell(pendulum(folder), SceneConfig(), CLOCK_NS)
-
-
 @pytest.mark.slow
 def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
@@ -102,7 +96,7 @@ def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: 
 
 @pytest.mark.slow
 def test_missed_cycles_do_not_lead_beyond_a_limit(tmp_path: Path) -> None:
-    cell = own_cell(tmp_path)
+    cell = build_cell(pendulum(tmp_path), SceneConfig(), CLOCK_NS)
     random = np.random.default_rng(0)
 
     def moved(is_guarded: bool) -> float:
@@ -128,7 +122,7 @@ def test_missed_cycles_do_not_lead_beyond_a_limit(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sample", [(np.nan, 0.0), (0.0, np.nan), (np.inf, 0.0)])
 def test_a_sample_that_is_not_finite_brakes(tmp_path: Path, sample: tuple[float, float]) -> None:
     FarArm.jumps = {1: sample}
-    arm = FarArm(own_cell(tmp_path), SceneConfig(), CLOCK_NS)
+    arm = FarArm(build_cell(pendulum(tmp_path), SceneConfig(), CLOCK_NS), SceneConfig(), CLOCK_NS)
     arm.enable()
     guard = GuardedArm(arm, TICK_S)
     guard.sense()
@@ -188,17 +182,13 @@ def test_an_arm_whose_samples_become_wrong_is_braked_within_its_limits(
     assert found & {"SENSOR_STUCK", "SENSOR_SILENT", "SENSOR_MODEL"}
 
 
-def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:
-    FarArm.jumps = jumps
-    return ServoRig(pendulum(folder), SceneConfig(), arm="tests.levels.arm.test_guard:FarArm")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("jump", "what"), [((9.0, 0.0), "position"), ((0.0, 99.0), "velocity")])
 def test_a_sample_beyond_a_limit_engages_the_brakes(
     tmp_path: Path, jump: tuple[float, float], what: str
 ) -> None:
-    servo = rig(tmp_path, dict.fromkeys(range(100, 103), jump))
+    FarArm.jumps = dict.fromkeys(range(100, 103), jump)
+    servo = ServoRig(pendulum(tmp_path), SceneConfig(), arm=f"{__name__}:FarArm")
     course = Course(START, GOAL, 0.8)
     servo.run(100, course.at)
     assert not servo.servo.arm.braked
@@ -219,7 +209,7 @@ def test_a_sample_beyond_a_limit_engages_the_brakes(
 
 @pytest.mark.slow
 def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
-    cell = own_cell(tmp_path)
+    cell = build_cell(pendulum(tmp_path), SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, TICK_S, speed_fraction=0.1)
     _, slow = drive_cycles(guard, arm, random_torques(cell, 0, 800))

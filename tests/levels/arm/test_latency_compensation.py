@@ -31,7 +31,7 @@ LATE = f"{__name__}:LateArm"
 class LateArm(IdealArm):
     """Its samples are `late` ticks old; from tick `stuck_from` on they keep their first joint."""
 
-    build_late_arm = 0
+    late = 0
     stuck_from = 1 << 30
 
     def __init__(self, *args: Any) -> None:

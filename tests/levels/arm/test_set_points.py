@@ -25,7 +25,6 @@ from tests.levels.arms import CLOCK_NS, config, pendulum, save_state
 
 TICK_S = CLOCK_NS * 1e-9
 SET_POINTS: tuple[Interface, ...] = ("position", "velocity")
-KINDS = ("jumps", "swings", "ramps", "beyond")
 
 
 @pytest.fixture(params=SET_POINTS)
@@ -111,7 +110,7 @@ def compute_load(cell: Cell) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["jumps", "swings", "ramps", "beyond"])
 def test_no_set_points_exceed_limits_of_the_simulated_arm(interface: Interface, kind: str) -> None:
     arm, made = build_simulated("puma560", interface)
     fastest = 0.0

@@ -31,25 +31,18 @@ def sense_wrist(arm: SimulatedArm) -> Array:
     return sample
 
 
-def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
-    """Push the tool at its site with a force, N, and a torque, N m, from the next step on."""
-    cell, data = arm.cell, arm._data
-    applied = np.zeros(cell.model.nv)
-    body = cell.model.site_bodyid[cell.tool]
-    centre, site = data.xipos[body], data.site_xpos[cell.tool]
-    mujoco.mj_applyFT(cell.model, data, force, torque, site, body, applied)
-    data.xfrc_applied[body, :3] = force
-    data.xfrc_applied[body, 3:] = torque + np.cross(site - centre, force)
-
-
 @pytest.mark.parametrize(
     "home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)]
 )
 def test_a_push_on_the_tool_is_the_wrench(tmp_path: Path, home: tuple[float, ...]) -> None:
     arm = build_arm(tmp_path, home)
     force, torque = np.array([5.0, -9.0, 12.0]), np.array([0.4, 0.3, -0.2])
+    cell, data = arm.cell, arm._data
+    body = cell.model.site_bodyid[cell.tool]
     for _ in range(200):
-        push(arm, force, torque)
+        # The tool is pushed at its site.
+        away = data.site_xpos[cell.tool] - data.xipos[body]
+        data.xfrc_applied[body] = [*force, *(torque + np.cross(away, force))]
         arm.step(1)
     sensed, state = sense_wrist(arm), np.array(arm._state)
     wrench, felt = compute_contact(arm.cell, arm.dynamics, sensed, state, STILL)

@@ -20,7 +20,7 @@ from rack.levels.task.actions import TransferPlanner
 from rack.levels.task.grasps import find_grasps
 from rack.levels.task.program import DOWN
 from rack.levels.task.rehearsal import Rehearsal
-from tests.levels.arms import CLOCK_NS, cell, config, find_situation, four_bar, pendulum
+from tests.levels.arms import CLOCK_NS, cell, config, find_situation, pendulum
 from tests.levels.robot import grippers
 
 ROBOT, SCENE = config("puma560")
@@ -67,7 +67,7 @@ def test_thin_object_is_gripped_by_the_spring_of_the_position_loop() -> None:
 
 def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
     # The cranks, 50 mm, close on 50 mm near asin(0.5): of 1 N m each, 1 / (0.05 cos(pi/6)) N.
-    made = build_cell(*four_bar(tmp_path), CLOCK_NS)
+    made = build_cell(*grippers.four_bar(tmp_path), CLOCK_NS)
     made.model.body_subtreemass[made.bodies[BLOCK1]] = 6.0
     with pytest.raises(Refused) as refused:
         Payloads(made, SCENE.objects).check_grip(BLOCK1, grip_of(made, BLOCK1))
@@ -87,22 +87,15 @@ def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
     assert got.value.code == Error.OVERLOAD
 
 
-STOP = '<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
-TOP_M = 0.7 + 0.03 + 0.01  # of the upper arm at home, and half of the post
-
-
-def hinged(folder: Path, apart: float) -> tuple[Cell, SceneConfig]:
-    """Return a two-joint arm whose carrier ends `apart`, m, above its first link at home."""
-    robot = pendulum(folder)
-    text = robot.model.read_text()
-    carrier = f'<body name="base">{STOP.format(z=TOP_M + apart)}<body name="upper"'
-    text = text.replace('<body name="upper"', carrier)
-    robot.model.write_text(text.replace("</worldbody>", "</body></worldbody>"))
-    return build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig()
-
-
 def test_links_keep_the_margin_only_in_planning(tmp_path: Path) -> None:
-    made, scene = hinged(tmp_path, 0.004)
+    # The carrier of a two-joint arm ends 4 mm above its first link at home.
+    robot, scene = pendulum(tmp_path), SceneConfig()
+    z = 0.7 + 0.03 + 0.01 + 0.004  # of the upper arm at home, half of the post, and 4 mm
+    post = f'<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
+    text = robot.model.read_text()
+    text = text.replace('<body name="upper"', f'<body name="base">{post}<body name="upper"')
+    robot.model.write_text(text.replace("</worldbody>", "</body></worldbody>"))
+    made = build_cell(robot, scene, CLOCK_NS)
     lifted = np.array([-0.0032 / 0.2, 0.5])  # 0.8 mm are left
     assert CollisionChecker(made, scene).is_free(lifted)
     planned = CollisionChecker(made, scene, MAX_DEVIATION_M)
@@ -112,22 +105,17 @@ def test_links_keep_the_margin_only_in_planning(tmp_path: Path) -> None:
     assert planned.is_free(lifted, planned.find_clearance(lifted))
 
 
-def lowest_grasp(folder: Path, length: float) -> float:
-    """Return how far above its origin block1 is taken with fingers of `length`, m."""
-    robot, scene = grippers.rotary(folder)
-    model = folder / "puma560.xml"
+@pytest.mark.parametrize(("length", "height"), [(0.08, 0.0), (0.098, 0.01)])
+def test_a_grasp_has_room_for_closing_fingers(tmp_path: Path, length: float, height: float) -> None:
+    robot, scene = grippers.rotary(tmp_path)
+    model = tmp_path / "puma560.xml"
     pad = f'size=".012 .006 {length / 2}" pos="0 0 {0.01 + length / 2}"'
     model.write_text(model.read_text().replace('size=".012 .006 .04" pos="0 0 .05"', pad))
     made = build_cell(robot, scene, CLOCK_NS)
     situation = find_situation(made)
     rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
     takes = next(TransferPlanner(rehearsal, 0, 0.1).find_pick_spots())
-    return float(takes[0].tool.position[2] - situation.positions[0, 2])
-
-
-@pytest.mark.parametrize(("length", "height"), [(0.08, 0.0), (0.098, 0.01)])
-def test_a_grasp_has_room_for_closing_fingers(tmp_path: Path, length: float, height: float) -> None:
-    assert lowest_grasp(tmp_path, length) == pytest.approx(height)
+    assert takes[0].tool.position[2] - situation.positions[0, 2] == pytest.approx(height)
 
 
 JAW_M = 0.025
@@ -138,14 +126,9 @@ def jaw_of(made: Cell) -> FixedJaw | None:
     return find_fixed_jaw(made, Payloads(made, ("block1", "block2", "peg")))
 
 
-def one_finger(folder: Path) -> Cell:
-    arm = grippers.one_finger(folder)
-    return build_cell(*arm, CLOCK_NS)
-
-
 @pytest.mark.parametrize("half", [0.01, 0.02, 0.03])
 def test_the_jaw_is_placed_next_to_an_object_of_any_width(tmp_path: Path, half: float) -> None:
-    made = one_finger(tmp_path)
+    made = build_cell(*grippers.one_finger(tmp_path), CLOCK_NS)
     geom = made.model.body_geomadr[made.bodies[0]]
     made.model.geom_size[geom] = half
     jaw = jaw_of(made)
@@ -157,7 +140,7 @@ def test_the_jaw_is_placed_next_to_an_object_of_any_width(tmp_path: Path, half: 
 
 
 def test_an_object_that_the_jaw_cannot_meet_does_not_move_the_tool(tmp_path: Path) -> None:
-    jaw = jaw_of(one_finger(tmp_path))
+    jaw = jaw_of(build_cell(*grippers.one_finger(tmp_path), CLOCK_NS))
     assert jaw is not None
     tool = Pose(np.array([0.5, 0.2, 0.475]), build_pointing_quaternion(DOWN))
     below = tool.raise_by(-0.2)

@@ -76,9 +76,9 @@ class PrimitiveRack(Lockstep):
         """Run until `segment` is done. Return False if that takes more than `seconds`."""
         return self.run(seconds, until=lambda rack: rack.read("primitive.status").done >= segment)
 
-    def run_until_error(self, seconds: float = 4.0) -> Any:
+    def run_until_error(self) -> Any:
         """Run until the level reports an error; return its status."""
-        self.run(seconds, until=lambda rack: rack.read("primitive.status").error != 0)
+        self.run(4.0, until=lambda rack: rack.read("primitive.status").error != 0)
         return self.status
 
 

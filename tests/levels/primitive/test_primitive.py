@@ -18,10 +18,6 @@ from tests.levels.primitive.rack import BEND, TURN, PrimitiveRack, gripper, path
 FIELDS = ("position", "velocity", "acceleration")
 
 
-def positions(rack: PrimitiveRack) -> np.ndarray:
-    return np.array([p["position"] for p in rack.set_points if p["due"]])
-
-
 def first(rack: PrimitiveRack, **wanted: int) -> int:
     """Return the index of the first status with the given fields."""
     shown = [all(s[name] == value for name, value in wanted.items()) for s in rack.seen]
@@ -92,7 +88,8 @@ def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves()
     assert refused.error == Error.TOO_LATE
     assert f"the earliest is {refused.earliest:.3f} s" in refused.reason
     rack.run(0.5)
-    assert np.ptp(positions(rack), axis=0).max() == 0.0
+    wanted = [p["position"] for p in rack.set_points if p["due"]]
+    assert np.ptp(wanted, axis=0).max() == 0.0
     again = PrimitiveRack()
     again.command(path(1, [again.home, again.home + TURN], by=refused.earliest))
     assert again.run_until_done(1)

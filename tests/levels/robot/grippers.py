@@ -48,6 +48,30 @@ SOFT_TENDONS = """
     <joint joint="finger_right" coef=".4"/><joint joint="tip_right" coef="-.4"/></fixed>
 </tendon>
 """
+FOUR_BAR_FINGER = """
+<body name="crank_{side}" pos="0 {x}.02 .06">
+  <inertial mass=".03" pos="0 0 .025" diaginertia="1e-5 1e-5 1e-6"/>
+  <joint name="crank_{side}" axis="{turn}1 0 0" range="-10 60" damping=".05" armature=".002"/>
+  <geom class="link" name="crank_{side}" type="capsule" fromto="0 0 0 0 0 .05" size=".003"/>
+  <body name="tip_{side}" pos="0 0 .05">
+    <inertial mass=".03" pos="0 0 .02" diaginertia="1e-5 1e-5 1e-6"/>
+    <joint name="tip_{side}" axis="{turn}1 0 0" damping=".005" armature=".001"/>
+    <geom class="pad" name="pad_{side}" type="box" size=".012 .006 .03" pos="0 {turn}.014 .02"/>
+  </body>
+</body>
+<body name="rod_{side}" pos="0 {x}.035 .06">
+  <inertial mass=".02" pos="0 0 .025" diaginertia="1e-5 1e-5 1e-6"/>
+  <joint name="rod_{side}" axis="{turn}1 0 0" damping=".005" armature=".001"/>
+  <geom class="link" name="rod_{side}" type="capsule" fromto="0 0 0 0 0 .05" size=".003"/>
+</body>
+"""
+STIFF = 'solref=".002 1" solimp=".99 .999 .001"'
+FOUR_BAR_EQUALITY = f"""
+<connect name="loop_left" body1="rod_left" body2="tip_left" anchor="0 0 .05" {STIFF}/>
+<connect name="loop_right" body1="rod_right" body2="tip_right" anchor="0 0 .05" {STIFF}/>
+<joint name="gear" joint1="crank_left" joint2="crank_right" {STIFF}/>
+"""
+CRANKS = {"joint": "crank_left", "open": 0.6, "closed": 0.0, "force": 2.0, "stiffness": 40.0}
 COUPLED_TENDONS = MIMIC + '<tendon tendon1="soft_left"/><tendon tendon1="soft_right"/>'
 SLIDING = {"joint": "finger_left", "open": 0.04, "closed": 0.0, "force": 40.0}
 ROTARY = {"joint": "finger_left", "open": 0.5, "closed": -0.4, "force": 4.0}
@@ -75,6 +99,8 @@ def hand(
         text = text.replace('<exclude body1="finger_left" body2="finger_right"/>', "")
     start, end = text.index("<equality>"), text.index("</equality>")
     text = text[:start] + "<equality>" + equality + text[end:]
+    driven = f'name="grip" joint="{gripper["joint"]}"'
+    text = text.replace('name="grip" joint="finger_left"', driven)
     more = f"{parts.get('actuator', '')}</actuator>{parts.get('tendon', '')}"
     text = text.replace("</actuator>", more)
     (folder / "puma560.xml").write_text(text)
@@ -100,6 +126,15 @@ def soft(folder: Path, **changed: Any) -> tuple[RobotConfig, SceneConfig]:
     """Two fingers that turn, their tips coupled by tendons to where their stops do not let them."""
     fingers = sides(TURNING, TIP, 'armature=".01"')
     return hand(folder, fingers, {**ROTARY, **changed}, COUPLED_TENDONS, tendon=SOFT_TENDONS)
+
+
+def four_bar(folder: Path) -> tuple[RobotConfig, SceneConfig]:
+    """Closed loops: a parallelogram a finger, two gears.
+
+    The cranks turn outwards by the opening, in rad; rods keep the tips parallel.
+    """
+    fingers = sides(FOUR_BAR_FINGER)
+    return hand(folder, fingers, {**CRANKS, "damping": 1.0}, FOUR_BAR_EQUALITY)
 
 
 def one_finger(folder: Path) -> tuple[RobotConfig, SceneConfig]:

@@ -15,7 +15,7 @@ from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.servo.control import Grip
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar
+from tests.levels.arms import CLOCK_NS, cell, config
 from tests.levels.robot import grippers
 from tests.levels.whole_rack import WholeRack
 
@@ -26,13 +26,9 @@ TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 Arm = tuple[RobotConfig, SceneConfig]
 
 
-def build_gripper_cell(arm: Arm) -> Cell:
-    return build_cell(*arm, CLOCK_NS)
-
-
 def close_gripper(arm: Arm, seconds: float) -> tuple[Cell, mujoco.MjData]:
     """Return the cell and its data after closing for some time, its loop at the clock's rate."""
-    made = build_gripper_cell(arm)
+    made = build_cell(*arm, CLOCK_NS)
     table = arm[0].gripper
     assert made.gripper is not None
     assert table is not None
@@ -49,7 +45,7 @@ def close_gripper(arm: Arm, seconds: float) -> tuple[Cell, mujoco.MjData]:
 
 def test_a_finger_with_a_motor_that_nothing_commands_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="joint 'finger_right' has an actuator, 'grip_"):
-        build_gripper_cell(grippers.independent(tmp_path))
+        build_cell(*grippers.independent(tmp_path), CLOCK_NS)
 
 
 def test_a_finger_that_follows_by_the_config_moves_with_the_driven_one(tmp_path: Path) -> None:
@@ -69,7 +65,7 @@ def test_a_finger_that_follows_by_the_config_moves_with_the_driven_one(tmp_path:
 )
 def test_a_follower_that_cannot_follow_is_refused(tmp_path: Path, joint: str, words: str) -> None:
     with pytest.raises(RobotError, match=words):
-        build_gripper_cell(grippers.independent(tmp_path, follow=[{"joint": joint}]))
+        build_cell(*grippers.independent(tmp_path, follow=[{"joint": joint}]), CLOCK_NS)
 
 
 def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -> None:
@@ -84,9 +80,9 @@ def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -
 
 def test_fingers_that_settle_away_from_their_planned_pose_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match=r"a finger settles .* mm from .*residual permits 0\.0 mm"):
-        build_gripper_cell(grippers.soft(tmp_path, residual=1e-9))
+        build_cell(*grippers.soft(tmp_path, residual=1e-9), CLOCK_NS)
     with pytest.raises(RobotError, match=r"robot\.gripper\.force: 1e-06 does not move"):
-        build_gripper_cell(grippers.soft(tmp_path, force=1e-6, stiffness=20.0, damping=0.1))
+        build_cell(*grippers.soft(tmp_path, force=1e-6, stiffness=20.0, damping=0.1), CLOCK_NS)
     with pytest.raises(ValidationError, match=r"both 0\.1: the gripper does not move"):
         GripperConfig(actuator="grip", joint="elbow", open=0.1, closed=0.1, force=1.0)
 
@@ -106,7 +102,7 @@ def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> N
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    "kind", [grippers.independent, grippers.soft, grippers.one_finger, four_bar]
+    "kind", [grippers.independent, grippers.soft, grippers.one_finger, grippers.four_bar]
 )
 def test_a_transfer_is_done_with_every_kind_of_gripper(tmp_path: Path, kind: Any) -> None:
     arm = kind(tmp_path, **FOLLOW if kind is grippers.independent else {})

@@ -28,21 +28,6 @@ def build(robot: RobotConfig) -> Cell:
     return build_cell(robot, config("utah_mit")[1], CLOCK_NS)
 
 
-def replace_in_model(folder: Path, old: str, new: str) -> RobotConfig:
-    """Return the hand with `old` in its model replaced."""
-    text = (ROBOTS / "utah_mit.xml").read_text()
-    assert text.count(old) == 1, old
-    (folder / "hand.xml").write_text(text.replace(old, new))
-    return config("utah_mit")[0].model_copy(update={"model": folder / "hand.xml"})
-
-
-def replace_in_table(**hand: Any) -> RobotConfig:
-    """Return the hand with keys of `[robot.hand]` replaced."""
-    robot = config("utah_mit")[0]
-    assert robot.hand is not None
-    return robot.model_copy(update={"hand": robot.hand.model_copy(update=hand)})
-
-
 def test_the_hand_has_four_fingers_and_sixteen_joints_with_two_tendons_each() -> None:
     made = build(config("utah_mit")[0])
     hand = made.hand
@@ -99,8 +84,12 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
     ],
 )  # fmt: skip
 def test_a_tendon_without_a_pair_is_refused(tmp_path: Path, old: str, new: str, why: str) -> None:
+    text = (ROBOTS / "utah_mit.xml").read_text()
+    assert text.count(old) == 1, old
+    (tmp_path / "hand.xml").write_text(text.replace(old, new))
+    robot = config("utah_mit")[0].model_copy(update={"model": tmp_path / "hand.xml"})
     with pytest.raises(RobotError, match=r"robot\.hand") as refused:
-        build(replace_in_model(tmp_path, old, new))
+        build(robot)
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -114,8 +103,11 @@ def test_a_tendon_without_a_pair_is_refused(tmp_path: Path, old: str, new: str, 
     ],
 )
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
+    robot = config("utah_mit")[0]
+    assert robot.hand is not None
+    hand = robot.hand.model_copy(update=what)
     with pytest.raises(RobotError, match=why):
-        build(replace_in_table(**what))
+        build(robot.model_copy(update={"hand": hand}))
 
 
 def test_a_hand_has_no_gripper_and_no_torque_limits() -> None:

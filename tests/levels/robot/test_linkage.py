@@ -10,7 +10,8 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell, build_cell
-from tests.levels.arms import CLOCK_NS, four_bar
+from tests.levels.arms import CLOCK_NS
+from tests.levels.robot.grippers import four_bar
 
 
 def build_linkage_cell(folder: Path, old: str = "", new: str = "") -> Cell:
@@ -19,17 +20,6 @@ def build_linkage_cell(folder: Path, old: str = "", new: str = "") -> Cell:
     arm = folder / "puma560.xml"
     arm.write_text(arm.read_text().replace(old, new, 1) if old else arm.read_text())
     return build_cell(robot, scene, CLOCK_NS)
-
-
-def settle_gripper(made: Cell, force: float) -> mujoco.MjData:
-    """Return the cell after a second with `force` on the gripper, its arm held at home."""
-    assert made.gripper is not None
-    data = made.build_start_data()
-    data.ctrl[made.gripper.actuator] = force
-    for _ in range(2000):
-        data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
-        mujoco.mj_step(made.model, data)
-    return data
 
 
 def compute_deviation(made: Cell, data: mujoco.MjData) -> float:
@@ -51,7 +41,13 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
     mujoco.mj_forward(made.model, data)
     equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     assert np.abs(data.efc_pos[equality]).max() < 1e-5
-    assert compute_deviation(made, settle_gripper(made, -1.0)) < 1e-3
+    # After a second with a force on the gripper, the arm held at home.
+    data = made.build_start_data()
+    data.ctrl[made.gripper.actuator] = -1.0
+    for _ in range(2000):
+        data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
+        mujoco.mj_step(made.model, data)
+    assert compute_deviation(made, data) < 1e-3
 
 
 LOOP = '<connect name="loop_left"'

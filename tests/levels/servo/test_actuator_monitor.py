@@ -25,24 +25,19 @@ class Dash:
 
     def __init__(self, rig: ServoRig, name: str, joint: int, side: float) -> None:
         robot, bounds = config(name)[0], rig.servo.arm.cell.bounds
-        self._home, self._joint, self._side = np.array(robot.home), joint, side
+        home, self._joint, self._side = np.array(robot.home), joint, side
         self.speed, self._hardest = 0.95 * bounds.velocity[joint], 0.9 * robot.acceleration[joint]
         self.way = self.speed**2 / self._hardest + 0.3
         low, high = np.clip(bounds.position[joint], -2.6, 2.6)
-        self._start = self._home.copy()
-        middle = np.clip(self._home[joint], low + 0.05 + self.way / 2, high - 0.05 - self.way / 2)
-        self._start[joint] = middle - side * self.way / 2
-
-    @property
-    def fastest_at(self) -> int:
-        """Tick at which the joint has reached that speed."""
-        return round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
+        start = home.copy()
+        middle = np.clip(home[joint], low + 0.05 + self.way / 2, high - 0.05 - self.way / 2)
+        start[joint] = middle - side * self.way / 2
+        self._approach = Course(home, start, APPROACH_S)
+        # Tick at which the joint has reached that speed.
+        self.fastest_at = round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        u = min(max(time_s / APPROACH_S, 0.0), 1.0)
-        way = self._start - self._home
-        position = self._home + way * u**3 * (10 - 15 * u + 6 * u * u)
-        velocity = way * 30 * u * u * (1 - u) ** 2 / APPROACH_S
+        position, velocity = self._approach.at(time_s)
         done, speed = self._along(max(time_s - APPROACH_S, 0.0))
         position[self._joint] += self._side * done
         velocity[self._joint] += self._side * speed

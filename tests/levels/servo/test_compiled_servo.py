@@ -55,10 +55,6 @@ def sample_of(seed: int, error: float) -> tuple[Any, ...]:
     return *state, *unusual, seed % 5 > 0, seed % 7 == 0
 
 
-def table(seed: int) -> Array:
-    return noise(seed, curves.REST + 1, JOINTS)
-
-
 def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     """Return the arguments of `compute_residuals`."""
     inertia = noise(seed + 1, 2, JOINTS, JOINTS)
@@ -92,7 +88,7 @@ def joints_of(seed: int) -> tuple[Any, ...]:
 
 CASES: dict[str, list[tuple[Any, ...]]] = {
     "set_motion": [
-        (table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS))
+        (noise(1, curves.REST + 1, JOINTS), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS))
         for ends_s in (0.01, 0.0135, np.inf)
     ],
     "check": [sample_of(seed, error) for seed in range(35) for error in (1e-6, 1e-2, np.nan)],

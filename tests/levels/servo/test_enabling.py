@@ -199,20 +199,15 @@ def test_guessed_values_keep_a_users_arm_disabled_but_not_a_simulated_one(tmp_pa
     assert not simulated.status.braked
 
 
-def whole(**robot: object) -> tuple[WholeRack, Operator, SimulatedArm]:
-    """Return the PUMA's rack, which tours three poses."""
-    config = load("nasrem-three-poses")
-    assert config.robot is not None
-    arm = config.robot.model_copy(update=robot), config.scene
-    rack = WholeRack("nasrem-three-poses", arm, params={"task": {"stalled_s": 3.0}})
-    simulated = cast(ServoExecutor, rack.tasks["servo"].level).arm
-    assert isinstance(simulated, SimulatedArm)
-    return rack, Operator(rack), simulated
-
-
 @pytest.mark.slow
 def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
-    rack, operator, arm = whole(enable="by-command", start=(0.3, 1.2, -2.8, 0.1, -1.2, 0.2))
+    config = load("nasrem-three-poses")
+    assert config.robot is not None
+    away = {"enable": "by-command", "start": (0.3, 1.2, -2.8, 0.1, -1.2, 0.2)}
+    given = config.robot.model_copy(update=away), config.scene
+    rack = WholeRack("nasrem-three-poses", given, params={"task": {"stalled_s": 3.0}})
+    arm = cast(ServoExecutor, rack.tasks["servo"].level).arm
+    assert isinstance(arm, SimulatedArm)
     rack.run(9.0)  # longer than a task may stall
     assert rack.task.state == State.HOLDING
     assert rack.task.reason.startswith("waiting for servo: disabled; to enable:")
@@ -221,7 +216,7 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     arm._read_joint_state()
     arm._rest[:] = arm._state[0]
     rack.run(0.5)
-    operator.say("servo", Operation.ENABLE)
+    Operator(rack).say("servo", Operation.ENABLE)
     assert rack.run_to_end(30.0).state == State.DONE
     status = rack.read("servo.status")
     assert (status.touches, status.violations) == (0, 0)

@@ -22,10 +22,6 @@ GOALS = {
 }
 
 
-def rig_of(name: str, **params: float) -> ServoRig:
-    return ServoRig(*config(name), **params)
-
-
 def course(name: str) -> Course:
     return Course(np.array(config(name)[0].home), np.array(GOALS[name]), 2.0)
 
@@ -44,7 +40,7 @@ def test_a_bridge_needs_most_acceleration_at_its_ends() -> None:
 
 @pytest.mark.parametrize("name", GOALS)
 def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str) -> None:
-    rig, move = rig_of(name), course(name)
+    rig, move = ServoRig(*config(name)), course(name)
     rig.run(900, move.at)
     errors = rig.errors(move.at)
     assert np.abs(errors).max() < 0.33e-3
@@ -56,7 +52,7 @@ def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str
 
 
 def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_limits() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
+    rig, move = ServoRig(*config("puma560")), course("puma560")
     limits = np.array(config("puma560")[0].acceleration)
     rig.run(400, move.at)
     speed = np.abs(rig.status.target_velocity).max()
@@ -70,7 +66,7 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
 
 
 def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
+    rig, move = ServoRig(*config("puma560")), course("puma560")
     rig.run(400, move.at)
     before = rig.status.position.copy()
     rig.rack.restart("servo")
@@ -94,7 +90,7 @@ GARBAGE = {
 
 @pytest.mark.parametrize("kind", GARBAGE)
 def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> None:
-    (robot, _), rig = config("puma560"), rig_of("puma560")
+    (robot, _), rig = config("puma560"), ServoRig(*config("puma560"))
     wrong = GARBAGE[kind]
     for _ in range(25):
         rig.run(PERIOD, lambda _: wrong)
@@ -110,7 +106,7 @@ def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> Non
 
 
 def test_a_set_point_due_in_the_far_future_is_refused() -> None:
-    rig = rig_of("puma560")
+    rig = ServoRig(*config("puma560"))
     rig.run(PERIOD)
     rig.set_point(rig.status.position + 0.2, np.zeros(6), 10**12)
     rig.run(20)
@@ -126,19 +122,14 @@ WEIGHT = """
 """
 
 
-@pytest.fixture
-def grasping(tmp_path: Path) -> ServoRig:
-    """A servo level whose gripper closes on a weight that starts to fall between the fingers."""
+def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(tmp_path: Path) -> None:
+    # The gripper closes on a weight that starts to fall between the fingers.
     robot, _ = config("puma560")
     model = tmp_path / "weight.xml"
     text = (ROBOTS / "puma560.xml").read_text()
     model.write_text(text.replace("<worldbody>", f"<worldbody>{WEIGHT}", 1))
-    rig = ServoRig(robot.model_copy(update={"model": model}), SceneConfig(objects=("weight",)))
-    rig.command.opening, rig.command.force, rig.command.held = 0.0, 40.0, 0
-    return rig
-
-
-def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping: ServoRig) -> None:
+    grasping = ServoRig(robot.model_copy(update={"model": model}), SceneConfig(objects=("weight",)))
+    grasping.command.opening, grasping.command.force, grasping.command.held = 0.0, 40.0, 0
     grasping.run(400, lambda _: (HOME, STILL))
     plan, scene = grasping.rack.read("servo.plan"), grasping.rack.read("servo.scene")
     assert (plan.held, plan.payload_mass) == (0, pytest.approx(1.5))

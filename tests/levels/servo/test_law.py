@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 
@@ -46,16 +48,14 @@ class PartialLaw(PdLaw):
 class LawRig(ServoRig):
     executor = PdLaw
 
+    @property
+    def law(self) -> PdLaw:
+        return cast(PdLaw, self.level)
+
 
 @pytest.fixture
 def rig() -> LawRig:
     return LawRig(*config("puma560"))
-
-
-def law_of(rig: ServoRig) -> PdLaw:
-    law = rig.servo
-    assert isinstance(law, PdLaw)
-    return law
 
 
 def test_a_law_follows_its_set_points_and_continues_after_a_restart(rig: LawRig) -> None:
@@ -69,14 +69,14 @@ def test_a_law_follows_its_set_points_and_continues_after_a_restart(rig: LawRig)
 
 def test_a_torque_that_is_nan_is_one_finding_and_braked_once(rig: LawRig) -> None:
     rig.run(100)
-    law_of(rig).scale = np.nan
+    rig.law.scale = np.nan
     rig.run(100)
     assert rig.status.clipped == 100
     assert rig.alarms() == [Alarm.COMMAND_INVALID, Alarm.BRAKES_CLOSED]
     assert rig.found[0].finding.subject == 1
     assert rig.status.braked
     assert "torque of 'j2' is not finite" in rig.status.reason
-    law_of(rig).scale = 1.0
+    rig.law.scale = 1.0
     rig.run(100)
     assert rig.alarms()[2:] == [Alarm.BRAKES_OPENED]
     assert (rig.status.braked, rig.status.clipped) == (0, 100)
@@ -84,7 +84,7 @@ def test_a_torque_that_is_nan_is_one_finding_and_braked_once(rig: LawRig) -> Non
 
 def test_a_torque_beyond_its_limit_is_cut_and_counted(rig: LawRig) -> None:
     rig.run(100)
-    law_of(rig).scale = 1e4
+    rig.law.scale = 1e4
     rig.run(1)
     assert rig.status.clipped >= 1
     assert abs(rig.status.torque[1]) <= rig.servo.cell.bounds.torque[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -127,13 +127,11 @@ class Bench:
     def switch(self, name: str, is_on: bool) -> str:
         return self.law.switch_modification(name, is_on)
 
-    def run(self, samples: int, wanted: Callable[[int], float] = lambda tick: 0.0) -> Array:
+    def run(self, samples: int) -> Array:
         """Return the torque of the third joint in each sample, N m."""
         found = []
         for _ in range(samples):
-            motion = Motion(np.zeros((3, JOINTS)))
-            motion.position[:] = wanted(self.tick)
-            given = motion, STATE, INERTIA, LOAD, self.tick
+            given = Motion(np.zeros((3, JOINTS))), STATE, INERTIA, LOAD, self.tick
             found.append(self.law.compute_torque(self._law, *given)[2])
             self.tick += 1
         return np.array(found)

@@ -26,14 +26,12 @@ def test_actions_of_every_kind_are_read() -> None:
         {**GOTO, "joints": [0, 0, 0, 0, 0, 0]},
         {"do": "home"},
     ]
-    transfer, pose, joints, home = read_program({"action": actions}, PUMA, SCENE).action
-    assert isinstance(transfer, Transfer)
-    assert transfer.by == 30.0
-    assert isinstance(pose, Goto)
-    assert pose.position == (0.5, 0.2, 0.7)
-    assert isinstance(joints, Goto)
-    assert joints.joints == (0.0,) * 6
-    assert isinstance(home, Home)
+    assert read_program({"action": actions}, PUMA, SCENE).action == (
+        Transfer(object="peg", to=(0.5, 0.3, 0.5), yaw=1.0, by=30.0),
+        Goto(position=(0.5, 0.2, 0.7), direction=(0.0, 0.0, -1.0)),
+        Goto(joints=(0.0,) * 6),
+        Home(),
+    )
     assert read_program({}, PUMA, SCENE).action == ()
 
 

@@ -13,8 +13,7 @@ import pytest
 
 from rack.backplane.segment import SHM_FOLDER
 from tests.processes import RACK, children_of, named, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack, read_refusal
-from tests.warm import Popen
+from tests.tools.command_line import BOUND_S, ROOT, rack, read_refusal, started
 
 pytestmark = pytest.mark.thorough
 
@@ -46,12 +45,8 @@ def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
     out = tmp_path / "campaign"
     options = (*LOCKSTEP, "--kinds", "kill,hang,self-test", "--out", str(out))
     trials = out / "trials"
-    command = [*RACK, "campaign", str(small), *options]
-    with Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-        try:
-            wait_until(lambda: len(list(trials.glob("0*.json"))) > 0, BOUND_S)
-        finally:
-            process.kill()
+    with started("campaign", small, *options, stdout=subprocess.DEVNULL, stderr=None):
+        wait_until(lambda: len(list(trials.glob("0*.json"))) > 0, BOUND_S)
     there = {path.name: path.stat().st_mtime_ns for path in trials.glob("*.json")}
     done = rack("campaign", small, *options)
     report = json.loads(done.stdout)

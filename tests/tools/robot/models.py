@@ -48,7 +48,14 @@ def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: b
         parts.append(joint("mount", parent, "hand", f"0 0 {below}", "0 0 1", **mount))
         limit = LIMIT.format(low=0, high=0.04, effort=30)
         if jaw:
-            parts += turning_finger()
+            # A jaw that is fixed to the hand, and a finger hinged next to it.
+            limit, hinge = LIMIT.format(low=0, high=1.0, effort=3), "0 0.012 0.02"
+            parts += [
+                link("jaw", "0.02 0.01 0.07", "0 -0.005 0.035", 0.1, 0.0001),
+                joint("weld", "hand", "jaw", "0 0 0.02", "0 0 1", limit="", kind="fixed"),
+                link("thumb", "0.02 0.01 0.07", "0 0.005 0.035", 0.1, 0.0001),
+                joint("hinge_of_thumb", "hand", "thumb", hinge, "-1 0 0", limit=limit),
+            ]
             return f'<robot name="small">{"".join(parts)}</robot>'
         for side, name in ((1, "left"), (-1, "right")):
             parts.append(link(name, "0.02 0.01 0.06", f"0 {0.005 * side} 0.03", 0.1, 0.0001))
@@ -56,17 +63,6 @@ def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: b
             moves = {"limit": limit, "kind": "prismatic", "mimic": mimic}
             parts.append(joint(f"{name}_finger", "hand", name, "0 0 0.02", f"0 {side} 0", **moves))
     return f'<robot name="small">{"".join(parts)}</robot>'
-
-
-def turning_finger() -> list[str]:
-    """Return a jaw that is fixed to the hand, and a finger hinged next to it."""
-    limit = LIMIT.format(low=0, high=1.0, effort=3)
-    return [
-        link("jaw", "0.02 0.01 0.07", "0 -0.005 0.035", 0.1, 0.0001),
-        joint("weld", "hand", "jaw", "0 0 0.02", "0 0 1", limit="", kind="fixed"),
-        link("thumb", "0.02 0.01 0.07", "0 0.005 0.035", 0.1, 0.0001),
-        joint("hinge_of_thumb", "hand", "thumb", "0 0.012 0.02", "-1 0 0", limit=limit),
-    ]
 
 
 def written(folder: Path, text: str, name: str = "small.urdf") -> Path:

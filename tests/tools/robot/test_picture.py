@@ -11,23 +11,16 @@ import pytest
 from PIL import Image
 
 from rack.boards.config import load
-from rack.levels.robot.cell import Cell, build_cell
+from rack.boards.config.cell import build_rack_cell
 from rack.tools.robot.picture import HEIGHT, NO_PICTURE, WIDTH, build_camera, draw_arm
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 ARMS = ["nasrem", "k1607", "penn", "hic", CONFIGS / "examples/own-arm/desk-arm.toml"]
 
 
-def build(name: str | Path) -> Cell:
-    """Return the cell of a config."""
-    config = load(name)
-    assert config.robot is not None
-    return build_cell(config.robot, config.scene, config.clock_ns)
-
-
 @pytest.mark.parametrize("name", ARMS)
 def test_everything_is_in_the_frame_and_fills_it(name: str | Path) -> None:
-    cell = build(name)
+    cell = build_rack_cell(load(name))
     model = cell.model
     data = cell.build_start_data()
     camera = build_camera(cell, data, np.ones(model.ngeom, bool))
@@ -48,7 +41,7 @@ def test_everything_is_in_the_frame_and_fills_it(name: str | Path) -> None:
 
 
 def test_the_picture_has_no_dark_background(tmp_path: Path) -> None:
-    if draw_arm(build("k1607"), tmp_path / "arm.png") == NO_PICTURE:
+    if draw_arm(build_rack_cell(load("k1607")), tmp_path / "arm.png") == NO_PICTURE:
         pytest.skip(NO_PICTURE)
     pixels = np.asarray(Image.open(tmp_path / "arm.png"))
     assert pixels.shape == (HEIGHT, WIDTH, 3)

@@ -10,7 +10,6 @@ from contextlib import closing
 from datetime import date
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -160,15 +159,20 @@ def test_a_rack_stays_until_its_recorder_has_begun(
 def test_a_rack_that_is_not_launched_leaves_no_folder(
     commanded: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start = Mock(side_effect=RecorderProcess._start, autospec=True)
-    monkeypatch.setattr(RecorderProcess, "_start", lambda recorder: start(recorder))
+    started: list[RecorderProcess] = []
+    start: Callable[[RecorderProcess], None] = RecorderProcess._start
+
+    def note(recorder: RecorderProcess) -> None:
+        started.append(recorder)
+        start(recorder)
+
+    monkeypatch.setattr(RecorderProcess, "_start", note)
     settings = {**LOCKSTEP, "name": rack_name, "board.lower.executor": "rack.levels.none:None"}
     own = rack.Rack(commanded, settings=settings, out=tmp_path / "run")
     with pytest.raises(rack.ConfigError), own:
         pass
     assert not (tmp_path / "run").exists()
-    ((recorder,), _) = start.call_args
-    start.assert_called_once()
+    (recorder,) = started
     assert recorder._process.poll() is not None
 
 

@@ -61,8 +61,11 @@ class PlayedArm:
         taken = self.taken
         asked, was_under_way = taken.needs_answer, taken.is_under_way
         taken.process_order(PROGRAM if order[0] else 0, *order)
-        if taken.needs_answer and asked:
-            self._plan(now_s)
+        if taken.needs_answer and asked and at(taken.order) in self.refuses:
+            taken.fail_order(Error.NO_PATH, "something is in the way")
+        elif taken.needs_answer and asked:
+            taken.set_response(Response.POSSIBLE)
+            self.until = now_s + self.keeps_s if self.keeps_s else 0.0
         elif taken.is_under_way:
             self._move(is_first=not was_under_way)
         self.report.program, self.report.echo = taken.program, taken.order
@@ -72,13 +75,6 @@ class PlayedArm:
         answer = Message(self.report.record.dtype)
         answer.copy_from(self.report)
         return Reading(answer, Verdict.NEW)
-
-    def _plan(self, now_s: float) -> None:
-        if at(self.taken.order) in self.refuses:
-            self.taken.fail_order(Error.NO_PATH, "something is in the way")
-        else:
-            self.taken.set_response(Response.POSSIBLE)
-            self.until = now_s + self.keeps_s if self.keeps_s else 0.0
 
     def _move(self, is_first: bool) -> None:
         step = at(self.taken.order)

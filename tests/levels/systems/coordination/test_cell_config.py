@@ -11,32 +11,9 @@ from rack.boards.config import load
 from tests.boards.config.mistakes import find_mistake
 
 RACK = """
-format = 2
-name = "cell"
-[clock]
-period_ms = 2.5
-mode = "lockstep"
-[board.task]
-slot = 2
-rate_hz = 4
-executor = "rack.levels.systems.coordination:Coordinator"
-ends_run = true
+extends = ["cell"]
 [board.task.params]
 arms = { puma = "lan.puma", k1607 = "lan.k1607" }
-[adapter.lan]
-slot = 3
-rate_hz = 20
-connect = ["unix/cell-puma"]
-[adapter.lan.export.puma]
-from = "task.order_puma"
-[adapter.lan.import.puma]
-from = "cell-puma/task.report"
-type = "rack.levels.systems.coordination.messages:CellReport"
-max_age_ms = 500
-[adapter.lan.import.k1607]
-from = "cell-k1607/task.report"
-type = "rack.levels.systems.coordination.messages:CellReport"
-max_age_ms = 500
 [[task.step]]
 do = [
     { arm = "puma", do = "home", by = 20.0 },
@@ -57,7 +34,11 @@ TOO_LONG = "an order can contain at most 32 ASCII characters"
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        (', k1607 = "lan.k1607" }', " }", f"{ARMS} = \"puma\": lacks 'k1607', the arm of {SECOND}"),
+        (
+            'arm = "k1607"',
+            'arm = "ur5"',
+            f"{ARMS} = \"puma, k1607\": lacks 'ur5', the arm of {SECOND}",
+        ),
         ('arm = "k1607"', 'arm = "puma"', f'{SECOND}.arm = "puma": {TWICE}'),
         ("by = 30.0", "by = 20.0", f"{LAST}[0].by = 20.0: must be later than 20, {EARLIER}"),
         (
@@ -73,8 +54,8 @@ TOO_LONG = "an order can contain at most 32 ASCII characters"
 )
 def test_each_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
     assert old in RACK
-    (tmp_path / "cell.toml").write_text(RACK.replace(old, new))
-    assert line in find_mistake(tmp_path / "cell.toml")
+    (tmp_path / "own.toml").write_text(RACK.replace(old, new))
+    assert line in find_mistake(tmp_path / "own.toml")
 
 
 ORDERED = (
@@ -97,7 +78,6 @@ REACH = {"arm": "puma", "do": "goto", "position": [0.45, 0.10, 0.95], "by": BY}
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_order_is_done_in_time_whichever_board_is_killed(rack_name: str) -> None:
     config = load("nasrem", [f"name={rack_name}", *ORDERED])
     with Rack(config.model_copy(update={"task": {"step": [{"do": [REACH]}]}})) as rack:

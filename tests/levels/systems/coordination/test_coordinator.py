@@ -38,12 +38,9 @@ class CellBench(Lockstep):
 
     def say(self, arm: str, response: Response = Response.NONE, **said: Any) -> None:
         """Have an arm answer the order that it is given, or only report."""
-        report, order = self.message(ARMS[arm]), self.order(arm)
-        report.echo, report.program, report.response = order.id, order.program, response
-        report.state = State.EXECUTING
-        for name, value in said.items():
-            setattr(report, name, value)
-        self.write(ARMS[arm], report)
+        order = self.order(arm)
+        answer = {"echo": order.id, "program": order.program, "response": response}
+        self.show(ARMS[arm], **({"state": State.EXECUTING} | answer | said))
 
     def both(self, response: Response) -> None:
         """Have both arms answer alike, and be read."""

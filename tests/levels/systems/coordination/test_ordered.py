@@ -67,23 +67,15 @@ class OrderBench(Lockstep):
             BoardSpec("elemental_move", MOVE_EVERY, PlayedMoves, above="task"),
         ]
         super().__init__(boards, ROBOT, SCENE, outside=outside)
-        servo = self.message("servo.status")
-        servo.target = np.array(ROBOT.home)
-        self.write("servo.status", servo)
-        peer = self.message("lan.peer_cell")
-        peer.ahead = ahead
-        self.write("lan.peer_cell", peer)
+        self.show("servo.status", target=np.array(ROBOT.home))
+        self.show("lan.peer_cell", ahead=ahead)
         self.revision = 0
         self.see()
 
     def see(self) -> None:
         """Show the world, with a new revision."""
-        puma, world = cell("puma560"), self.message("world.model")
-        start = puma.build_start_data()
         self.revision += 1
-        world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
-        world.revision = self.revision
-        self.write("world.model", world)
+        self.show_start(cell("puma560"), self.revision)
 
     def order(
         self, what: OrderVerb, action: Action = HOME, number: int = 1000, **said: Any
@@ -94,9 +86,6 @@ class OrderBench(Lockstep):
         for name, value in said.items():
             setattr(order, name, value)
         self.write("lan.orders", order)
-
-    def lose_orders(self, is_lost: bool) -> None:
-        self.boxes["lan.orders"].lost = is_lost
 
     def until(self, *responses: Response, seconds: float = 20.0) -> Message:
         """Run until the report says one of these; return it."""
@@ -200,12 +189,12 @@ def test_arm_holds_while_its_orders_are_lost_and_then_continues() -> None:
     assert (bench.status.state, bench.status.reason) == (State.HOLDING, "k1607 is lost")
     bench.order(OrderVerb.DO, TRANSFER)
     bench.run(1.0)
-    bench.lose_orders(True)
+    bench.boxes["lan.orders"].lost = True
     bench.run(1.0)
     why = "rack 'cell' is lost: held until it is back"
     assert (bench.status.state, bench.status.reason) == (State.HOLDING, why)
     assert bench.read("task.command").hold
-    bench.lose_orders(False)
+    bench.boxes["lan.orders"].lost = False
     assert bench.until(Response.DONE).moves_done == 8
 
 

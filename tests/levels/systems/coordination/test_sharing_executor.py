@@ -69,9 +69,6 @@ class Hoist(ServoRig):
         self.course = Course(np.array([AWAY_M]), np.array([AWAY_M]), 1.0)
         self.begun = 0
 
-    def grip(self, opening: float) -> None:
-        self.command.opening = opening
-
     def go(self, height: float) -> None:
         """Move the hand to a height, m, within `MOVE_S`."""
         self.course = Course(self.course.goal, np.array([height]), MOVE_S)
@@ -102,7 +99,6 @@ class Pair:
     """Two racks that read each other's messages one exchange, 20 ms, later; unless `apart`."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
         self.alpha, self.beta = Hoist(folder, "alpha"), Hoist(folder, "beta")
         self.apart = False
         self.claims: list[tuple[Claim, Claim]] = []
@@ -129,7 +125,7 @@ class Pair:
     def _grip_below(self, hoist: Hoist, opening: float, seconds: float, height: float) -> None:
         hoist.go(0.0)
         self.run(0.6)
-        hoist.grip(opening)
+        hoist.command.opening = opening
         self.run(seconds)
         hoist.go(height)
         self.run(0.6)
@@ -145,7 +141,6 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
     np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
@@ -170,7 +165,7 @@ def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair
         hoist.go(0.0)
     pair.run(0.6)
     for hoist in hoists:
-        hoist.grip(CLOSED)
+        hoist.command.opening = CLOSED
     pair.run(0.4)
     assert (Claim(1, b"alpha"), Claim(1, b"beta")) in pair.claims
     assert pair.alpha.claim == pair.beta.claim == Claim(1, b"beta")

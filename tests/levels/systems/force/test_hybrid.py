@@ -60,9 +60,7 @@ class HybridRig:
             "world.model": WorldState,
         }
         self.rack = Lockstep(boards, robot, scene, outside=outside, clock_ns=CLOCK_NS)
-        world = self.rack.message("world.model")
-        world.revision = 1
-        self.rack.write("world.model", world)
+        self.rack.show("world.model", revision=1)
         self.compliance = self.rack.message("trajectory.compliance")
         self.compliance.frame = (1.0, 0.0, 0.0, 0.0)
         self._request = self.rack.message("client.requests")

@@ -7,22 +7,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import copy_message
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus
 from rack.levels.systems.force.frames import HEAD, MAGIC, FrameKind
-from rack.levels.systems.force.messages import ServerRequest, ServerStatus
+from rack.levels.systems.force.messages import ServerRequest
 from rack.levels.systems.force.network_client import RemoteServer, main, run_client
 from rack.levels.systems.force.network_server import SILENT_S, NetworkServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.tools.viewer.window import find_free_port
-from tests.levels.systems.force.test_client import CONTEXT
+from tests.levels.systems.force.test_client import CONTEXT, Bus
 from tests.processes import BOUND_S, in_thread, wait_until
 
 HOST = "127.0.0.1"
@@ -35,38 +32,26 @@ print(bus.tick)
 """It waits until the rack's side reports its request as done."""
 
 
-class RackSide:
+class RackSide(Bus):
     """Bus and ports of the program that serves clients: ticks pass as it waits."""
 
     def __init__(self, is_paced: bool, places: int = 1000) -> None:
-        self.is_paced, self.is_over = is_paced, False
-        self.tick = self.sent = 0
+        super().__init__()
+        self.is_paced = is_paced
         self.places = places  # of the ring
-        self.requests: list[ServerRequest] = []
         self.waits: list[float] = []
-        self.status = ServerStatus.zeros(CONTEXT.sizes)
         self.status.place = (0.5, 0.25, 0.125)
-        self.message = ServerRequest.zeros(CONTEXT.sizes)
-
-    @property
-    def time_s(self) -> float:
-        return self.tick * 1e-3
 
     def wait(self, timeout_s: float) -> bool:
         self.waits.append(timeout_s)
-        self.tick += 20
         self.status.done = max([request.id for request in self.requests], default=0)
-        return True
-
-    def read(self) -> Reading[ServerStatus]:
-        return Reading(self.status, Verdict.NEW)
+        return super().wait(timeout_s)
 
     def send(self) -> bool:
         if len(self.requests) >= self.places:
             return False
-        self.requests.append(copy_message(self.message))
         self.sent += 1
-        return True
+        return super().send()
 
 
 class Served:
@@ -84,7 +69,7 @@ class Served:
 
     def run(self) -> None:
         try:
-            self._program.run(cast("Bus", self.side))
+            self._program.run(self.side)  # type: ignore[arg-type]
         except LevelError as error:
             self.error = str(error)
         self.is_done = True

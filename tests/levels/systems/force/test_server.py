@@ -58,10 +58,6 @@ class ServerRig(TrajectoryRig):
         wanted = {"frame": FRAME, "selected": (0, 0, 1, 0, 0, 0), "wrench": (0, 0, force, 0, 0, 0)}
         return self.request(MotionKind.COMPLY, **{**wanted, **fields})
 
-    def free(self) -> int:
-        """Queue the end of compliance; return its id."""
-        return self.request(MotionKind.COMPLY)
-
     def guard(self, force: float) -> int:
         """Queue a guard of the z axis; return its id."""
         return self.request(MotionKind.GUARD, frame=FRAME, guard=(0, 0, force, 0, 0, 0))
@@ -130,7 +126,7 @@ def test_compliance_is_done_when_the_force_is_as_wanted_and_keeps_it_over_an_edg
     assert rig.places[-1][2] < HEIGHT - 0.012
     assert abs(rig.pressed[-1] - 15.0) < 0.5
     # Motion after it begins where the arm is, without a step.
-    rig.free()
+    rig.request(MotionKind.COMPLY)  # its end
     up = rig.line((X, EDGE + 0.05, HEIGHT + 0.05), 1.0)
     rig.run(3.0)
     assert rig.ends()[up] == RequestEnd.DONE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from rack.backplane.message import Message
@@ -34,15 +36,13 @@ class Swing(Executor):
         self.hand = hand
         finger = context.params.get("finger")
         everything = np.ones(len(hand.arms), bool)
-        names = hand.names
-        self.driven = everything if finger is None else hand.fingers[names.index(finger)]
-        self.is_blind = False  # it takes no new status
+        self.driven = everything if finger is None else hand.fingers[hand.names.index(finger)]
         self.override: float | None = None  # N: commanded of all tendons instead
 
     def process(self, tick: int) -> None:
         status, command, hand = self.below.message, self.command, self.hand
-        if not self.below.has_message or self.is_blind:
-            command.sampled = -1 if not self.below.has_message else command.sampled
+        if not self.below.has_message:
+            command.sampled = -1
             return
         swing = AMPLITUDE_RAD * np.sin(RATE * tick * self.context.tick_s)
         wanted = np.array(self.context.robot.home) + swing
@@ -68,14 +68,10 @@ class HandRig(Lockstep):
 
     @property
     def executor(self) -> HandExecutor:
-        level = self.tasks["hand"].level
-        assert isinstance(level, HandExecutor)
-        return level
+        return cast(HandExecutor, self.tasks["hand"].level)
 
     def swing(self, board: str = "all") -> Swing:
-        level = self.tasks[board].level
-        assert isinstance(level, Swing)
-        return level
+        return cast(Swing, self.tasks[board].level)
 
     @property
     def status(self) -> Message:

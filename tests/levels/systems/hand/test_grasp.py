@@ -105,7 +105,6 @@ HOLD = {"do": "hold", "seconds": 0.8}
 RELEASE = {"do": "release", "seconds": 0.4}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("boards", ["loops", "fingers"])
 def test_an_object_is_lifted_kept_while_it_is_pulled_and_put_back(boards: str) -> None:
     rig = GraspRig(boards, [PRESHAPE, CLOSE, SQUEEZE, LIFT, HOLD, LOWER, RELEASE], (PULL,))
@@ -121,7 +120,6 @@ def test_an_object_is_lifted_kept_while_it_is_pulled_and_put_back(boards: str) -
     assert not rig.read("hand.status").force.any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("board", ["grasp", "joint", "hand"])
 def test_a_board_that_dies_leaves_the_object_in_the_hand(board: str) -> None:
     rig = GraspRig("loops", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 0.5}])

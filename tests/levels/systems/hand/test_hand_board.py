@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.kinds import KINDS
-from rack.levels.level import Demand, Fault, LevelContext, Pace
+from rack.levels.level import Demand, Fault, Pace
 from rack.levels.messages import Error
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.messages import EXTENSOR
@@ -128,15 +128,11 @@ def test_tension_beyond_its_limits_is_cut(asked: float, given: float) -> None:
     assert found == [(Alarm.TENSION_LIMIT, asked)]
 
 
-def tear(rig: HandRig, joint: int, side: int) -> None:
-    kind = KINDS["tendon-torn"]
-    rig.executor.inject([Fault(kind.name, {"joint": joint, "side": side}, 1, rig.tick, kind.step)])
-
-
 def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
-    rig = swinging(())
-    tear(rig, 5, EXTENSOR)
-    assert str(KINDS["tendon-torn"].bound) == "6 cycles"
+    rig, kind = swinging(()), KINDS["tendon-torn"]
+    torn = Fault(kind.name, {"joint": 5, "side": EXTENSOR}, 1, rig.tick, kind.step)
+    rig.executor.inject([torn])
+    assert str(kind.bound) == "6 cycles"
     rig.cycles(6)
     assert [(found.alarm, found.subject) for found in rig.executor.findings] == [(Alarm.TENDON, 5)]
     assert rig.executor.acted
@@ -153,13 +149,6 @@ def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
     assert_follows(rig)
 
 
-def board_context(above: dict[str, str | None]) -> LevelContext:
-    """Return the context of a hand's board below boards with the fingers that they drive."""
-    driven = {name: {"finger": finger} if finger else {} for name, finger in above.items()}
-    paces = {name: Pace(EVERY, 1, params) for name, params in driven.items()}
-    return context("hand", config("utah_mit"), every=EVERY, clock_ns=CLOCK_NS, above=paces)
-
-
 @pytest.mark.parametrize(
     ("above", "why"),
     [
@@ -170,6 +159,9 @@ def board_context(above: dict[str, str | None]) -> LevelContext:
     ],
 )
 def test_one_board_must_drive_every_joint(above: dict[str, str | None], why: str) -> None:
-    found = [misfit[2] for misfit in HandExecutor.find_mismatches(board_context(above))]
+    driven = {name: {"finger": finger} if finger else {} for name, finger in above.items()}
+    paces = {name: Pace(EVERY, 1, params) for name, params in driven.items()}
+    board = context("hand", config("utah_mit"), every=EVERY, clock_ns=CLOCK_NS, above=paces)
+    found = [misfit[2] for misfit in HandExecutor.find_mismatches(board)]
     assert found[:1] == ([why] if why else [])
     assert len(found) in (0, 4)

@@ -33,15 +33,11 @@ def test_open_valves_resist_a_short_push_less_but_the_more_the_higher_the_preten
     assert stiff / soft == pytest.approx(np.full(3, 1.7), rel=0.02)
 
 
-def build_hand(stiffening: float) -> SimulatedHand:
-    config = load("hic", [f"robot.hand.stiffening={stiffening}"])
-    cell = build_cell(config.robot, config.scene, config.clock_ns)
-    return SimulatedHand(cell, config.scene, config.clock_ns)
-
-
 @pytest.mark.parametrize("stiffening", [0.0, 0.0483])
 def test_closed_valves_return_to_their_tension_when_a_push_ends(stiffening: float) -> None:
-    hand = build_hand(stiffening)
+    config = load("hic", [f"robot.hand.stiffening={stiffening}"])
+    cell = build_cell(config.robot, config.scene, config.clock_ns)
+    hand = SimulatedHand(cell, config.scene, config.clock_ns)
     before = hand.commanded_tensions
     tip = hand.cell.model.site_bodyid[hand.hand.tips[0]]
     farthest = 0.0

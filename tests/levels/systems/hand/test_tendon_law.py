@@ -9,7 +9,6 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.level import LevelContext
-from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.laws import TendonGains, TendonLaw
 from rack.levels.systems.hand.messages import HandStatus
 from tests.levels.arms import cell, config
@@ -20,18 +19,14 @@ PERIOD_S = CONTEXT.period_s
 EXACT = TendonGains(lead=0.0, trim=0.0, margin=0.0)
 
 
-def the_hand() -> Hand:
-    hand = cell("utah_mit").hand
-    assert hand is not None
-    return hand
-
-
 class Valves:
     """Valves of all tendons with gain, offset and lag. Sensed tensions are a cycle old."""
 
     def __init__(self, gain: float = 1.0, offset: float = 0.0, gains: TendonGains = EXACT) -> None:
-        self.hand, self._gain, self._offset = the_hand(), gain, offset
-        joints = len(self.hand.arms)
+        hand = cell("utah_mit").hand
+        assert hand is not None
+        self.hand, self._gain, self._offset = hand, gain, offset
+        joints = len(hand.arms)
         self.status = HandStatus.zeros({"joints": joints, "fingers": 4})
         self.status.tension = self.status.wanted = self.hand.rest
         self.tension = np.full((2, joints), self.hand.rest)

@@ -9,12 +9,12 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, copy_message
-from rack.levels.algebra import Array, mat_vec
+from rack.levels.algebra import mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.messages import WorldState
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
-from rack.levels.systems.hand.workstation import GraspPlanner, GraspRules, PlannedGrasp, Workstation
+from rack.levels.systems.hand.workstation import GraspPlanner, GraspRules, Workstation
 from tests.levels.arms import cell, config, context
 
 HAND = cell("utah_mit")
@@ -122,29 +122,10 @@ RULES = GraspRules()
 AT, UPRIGHT = START.xpos[HAND.bodies[0]].copy(), np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@pytest.fixture(scope="module")
-def planner() -> GraspPlanner:
-    return GraspPlanner(HAND, "thumb", RULES)
-
-
-@pytest.fixture(scope="module")
-def planned(planner: GraspPlanner) -> PlannedGrasp:
-    found = planner.plan(0, AT, UPRIGHT)
-    assert found is not None
-    return found
-
-
-def tips(posture: Array) -> Array:
-    """Return the tips at joint positions, (fingers, 3), m, in the palm's frame."""
-    assert HAND.hand is not None
-    kinematics = FingerKinematics(HAND, HAND.hand)
-    kinematics.set_position(posture)
-    return np.array([kinematics.find_tip(finger) for finger in range(4)])
-
-
 @pytest.mark.slow
-def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planned: PlannedGrasp) -> None:
-    found = planned
+def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface() -> None:
+    found = GraspPlanner(HAND, "thumb", RULES).plan(0, AT, UPRIGHT)
+    assert found is not None
     radii = np.sqrt((found.contact[:, :2] ** 2).sum(axis=1))
     assert radii == pytest.approx(np.full(4, CAN_RADIUS_M))
     assert found.normal[:3] == pytest.approx(-found.normal[[3, 3, 3]])
@@ -155,7 +136,11 @@ def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planned: Plann
     outside = AT + found.contact - RULES.clear * found.normal
     palm = START.site_xmat[HAND.tool].reshape(3, 3).T
     wanted = np.array([mat_vec(palm, point - START.site_xpos[HAND.tool]) for point in outside])
-    assert np.abs(tips(found.posture) - wanted).max() < 2e-3
+    assert HAND.hand is not None
+    kinematics = FingerKinematics(HAND, HAND.hand)
+    kinematics.set_position(found.posture)
+    tips = np.array([kinematics.find_tip(finger) for finger in range(4)])
+    assert np.abs(tips - wanted).max() < 2e-3
 
 
 @pytest.mark.slow

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.level import Pace
 from rack.levels.messages import Error
 from rack.levels.robot.cell import compute_sizes
@@ -16,18 +14,12 @@ from rack.levels.systems.joint_boards.gateway import JointGateway
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from tests.levels.arms import cell, config, context
 
-M = TypeVar("M", bound=Message)
-
 TICK_S = 0.001
 PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
 LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
 """Velocity of every joint, rad/s."""
 SIZES = compute_sizes(cell("puma560"))
-
-
-def message(kind: type[M]) -> M:
-    return kind.zeros(SIZES)
 
 
 class GatewayRig:
@@ -38,7 +30,7 @@ class GatewayRig:
         given = {"every": EVERY, "sizes": SIZES, "above": {"above": Pace(PERIOD, 1)}}
         given["params"] = {"delay": DELAY * TICK_S, "missing": MISSING}
         self.gateway = JointGateway(context("gateway", config("puma560"), **given, below=paces))
-        self.statuses = {name: message(JointStatus) for name in paces}
+        self.statuses = {name: JointStatus.zeros(SIZES) for name in paces}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::2] = 1
             status.target[k::2] = 1.0 + k
@@ -56,7 +48,7 @@ class GatewayRig:
         """Run the motion up to a tick; references come `late` ticks late, or are `missing`."""
         for _ in range(ticks // EVERY):
             made = (self.tick - PERIOD - late) // PERIOD * PERIOD
-            reference = message(JointReference)
+            reference = JointReference.zeros(SIZES)
             is_new = made > self.made and made >= 0 and not missing
             if is_new:
                 self.made = made

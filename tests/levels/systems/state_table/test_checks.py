@@ -97,24 +97,18 @@ CONDITIONS = st.dictionaries(
 )
 
 
-def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowConfig:
-    """Return a row of the state "on" whose only possible mistakes are its cases."""
-    known = {name: sorted(values & set(DOORS.conditions[name])) for name, values in when.items()}
-    conditions = {name: values for name, values in known.items() if values}
-    return RowConfig(
-        **{"name": f"row {number}", "state": "on", "when": conditions, "else": otherwise},
-        next="on",
-        do=[],
-        status="idle",
-    )
-
-
 @pytest.mark.slow
 @given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
 def test_a_table_passes_if_one_row_fires_in_each_case(
     rows: list[tuple[dict[str, set[str]], bool]],
 ) -> None:
-    configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}
+    # The only possible mistakes of the rows are their cases.
+    configs = {}
+    for number, (when, otherwise) in enumerate(rows, 1):
+        known = {name: sorted(values & {*DOORS.conditions[name]}) for name, values in when.items()}
+        conditions = {name: values for name, values in known.items() if values}
+        row = {"name": f"row {number}", "state": "on", "when": conditions, "else": otherwise}
+        configs[number] = RowConfig(**row, next="on", do=[], status="idle")
     table = StateTable("on", 1.0, configs, DOORS.plan(), 0, ())
     complaints = find_flaws(table, DOORS, LEXICON)
     cases = [

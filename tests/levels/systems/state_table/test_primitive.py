@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 import pytest
 
@@ -14,8 +12,6 @@ from rack.boards.config.resolved import resolve
 from rack.levels.level import LevelContext
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
 from rack.levels.systems.state_table.primitive import JointMove, JointMoveStatus, PrimitiveTable
-
-M = TypeVar("M", bound=Message)
 
 BOARDS = ("first", "second")
 
@@ -34,21 +30,18 @@ class Bench:
         self.context = context
         self.level = PrimitiveTable(context)
         self.home = self.level._point[0].copy()
-        self.arm = self.message(ArmStatus)
+        self.arm = ArmStatus.zeros(self.context.sizes)
         self.arm.opening = self.level._gripper.open
-        self.below = [self.message(JointStatus) for _ in BOARDS]
+        self.below = [JointStatus.zeros(self.context.sizes) for _ in BOARDS]
         self.readings = [Reading(below, Verdict.NEW) for below in self.below]
         for below in self.below:
             below.position = self.home
         self.above: dict[str, Reading] = {}
         self.tick = 10 * context.every
 
-    def message(self, kind: type[M]) -> M:
-        return kind.zeros(self.context.sizes)
-
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
         """Set the command of the level above from now on."""
-        command = self.message(JointMove)
+        command = JointMove.zeros(self.context.sizes)
         command.joints, command.speed, command.object = joints, speed, row
         self.above = {"move": Reading(command, Verdict.NEW)}
 
@@ -202,13 +195,13 @@ def test_a_gripper_that_cannot_close_completely_holds_something(
 
 
 def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) -> None:
-    last = bench.message(JointMoveStatus)
+    last = JointMoveStatus.zeros(bench.context.sizes)
     last.closed = last.held = last.object = 1
     last.table = bench.level.table_name
     last.in_state = bench.level.state
     last.position = bench.home + 0.1
     last.end = bench.home + 0.2
-    command = bench.message(JointReference)
+    command = JointReference.zeros(bench.context.sizes)
     command.id = 77
     level = bench.level
     vars(level).update(

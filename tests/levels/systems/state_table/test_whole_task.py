@@ -9,7 +9,7 @@ from tests import golden
 from tests.snapshots import Snapshots
 from tests.whole_runs import whole_run
 
-pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+pytestmark = pytest.mark.thorough
 SNAPSHOTS = Snapshots(__file__)
 
 

@@ -67,13 +67,9 @@ class Level:
         """Do nothing."""
 
 
-def motions(level: Level) -> Motions:
-    return Motions(level, level, level, CONTEXT)
-
-
 def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> None:
     level = Level()
-    arm = motions(level)
+    arm = Motions(level, level, level, CONTEXT)
     arm.release()
     arm.line((0.1, 0.2, 0.3), body="block2", segment=2.0)
     arm.grip(0.01, force=5.0)
@@ -99,7 +95,7 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
 def test_no_request_is_left_out(room: int, loses: tuple[int, ...]) -> None:
     level = Level(room=room)
     level.loses = {*loses}
-    arm = motions(level)
+    arm = Motions(level, level, level, CONTEXT)
     for _ in range(10):
         arm.stay(0.1)
     assert arm.wait()
@@ -108,7 +104,7 @@ def test_no_request_is_left_out(room: int, loses: tuple[int, ...]) -> None:
 
 def test_a_restarted_process_cancels_first_and_uses_new_numbers() -> None:
     level = Level(sent=7)
-    arm = motions(level)
+    arm = Motions(level, level, level, CONTEXT)
     arm.stay(0.1)
     sent = [(request.id, request.kind) for request in level.queue]
     assert sent == [(8, MotionKind.CANCEL), (9, MotionKind.STAY)]
@@ -118,4 +114,4 @@ def test_a_request_that_finds_the_queue_full_at_the_end_of_the_run_is_given_up()
     level = Level(room=0)
     level.is_over = True
     with pytest.raises(RunOver, match="the run is over"):
-        motions(level).move()
+        Motions(level, level, level, CONTEXT).move()

@@ -68,7 +68,6 @@ def test_a_request_fails_after_its_waits_unless_somebody_stops_the_arm(waits: st
         rig.say(Operation.HOLD)
     elif waits == "a required stop":
         rig.level.demand = Demand.STOP
-    status = rig.written["status"]
     # The boards hold again and again, each time for less than the limit.
     for _ in range(8):
         for board in rig.statuses.values():
