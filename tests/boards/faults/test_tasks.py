@@ -121,3 +121,18 @@ def test_a_task_has_the_faults_that_are_active_by_its_tick(make_bus: MakeBus) ->
     assert (entries[2].count, entries[2].struck_tick) == (1, 6)
     faults.burn_time(7)
     assert (entries[0].count, entries[0].struck_tick) == (1, 7)
+
+
+def test_a_simulated_hog_acts_once_a_cycle_of_its_task(make_bus: MakeBus) -> None:
+    segment = make_bus(task("level"), task("other"))
+    segment.words[System.LOCKSTEP] = 1
+    entry = FaultTable(segment).add_fault(Injection(KINDS["hog"].number, 0, tick=4))
+    entry.stage, entry.tick, entry.until = Stage.ACTIVE, 4, 10
+    level, other = (
+        TaskFaults(segment, segment.layout.find_task(name), Mock(), Mock())
+        for name in ("level", "other")
+    )
+    other.refresh_faults(5)
+    assert (other.taken_until, entry.count) == (10, 0)
+    level.refresh_faults(5)
+    assert (level.taken_until, entry.count, entry.struck_tick) == (10, 1, 5)

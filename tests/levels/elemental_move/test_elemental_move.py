@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
+from rack.levels.elemental_move.planner import ElementalMovePlanner, PlanningJob
+from rack.levels.messages import Verb
+from rack.levels.motion.path import Path
+from rack.levels.planning.moves import Move
+from rack.levels.planning.pose import make_pose
+from rack.levels.robot.cell import compute_sizes
 from rack.levels.tables import MotionConfig
+from tests.levels.arms import cell, config, context
 from tests.levels.whole_rack import WholeRack
 
 pytestmark = pytest.mark.slow
@@ -46,6 +53,17 @@ def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> N
         idle = 0 if busy else idle + 1
         longest = max(longest, idle)
     assert longest * 10 < 100
+
+
+def test_a_new_path_of_a_move_replaces_the_earlier_one() -> None:
+    sizes = compute_sizes(cell("puma560"))
+    planner = ElementalMovePlanner(context("elemental_move", config("puma560"), sizes=sizes))
+    first, other, again = (Path(np.full((2, 6), number), np.zeros(2)) for number in range(3))
+    pose, joints = make_pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), np.zeros(6)
+    moves = [Move(k, 0, Verb.MOVE, None, pose, joints, posture=False, by_s=0.0) for k in (1, 2)]
+    for move, path in zip((*moves, moves[0]), (first, other, again), strict=True):
+        planner._record_path(PlanningJob(move, path.waypoints[0]), path, visible_at=10)
+    assert [found.path for found in planner._published] == [again, other]
 
 
 @pytest.mark.thorough

@@ -129,12 +129,21 @@ def test_an_arm_without_gripper_or_scene_follows_a_path_and_refuses_a_grasp() ->
     assert rack.run_until_error().reason == "segment 2: the arm has no gripper; valid: paths"
 
 
-def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
-    rack = PrimitiveRack(params={"following": 1e-6})
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [
+        ({"following": 1e-6}, "from its set point"),
+        ({"settled": 1e-12, "settling": 0.5}, "from its goal; valid: at most 1e-12 rad"),
+    ],
+)
+def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest(
+    params: dict[str, float], said: str
+) -> None:
+    rack = PrimitiveRack(params=params)
     rack.command(path(1, [rack.home, rack.home + TURN]))
     status = rack.run_until_error()
     assert status.error == Error.FOLLOWING
-    assert "from its set point" in status.reason
+    assert said in status.reason
     rack.run(1.0)
     assert rack.status.resting
     assert rack.status.done == 0

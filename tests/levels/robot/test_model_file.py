@@ -120,7 +120,7 @@ def test_an_image_that_would_take_all_memory_is_refused(tmp_path: Path) -> None:
 
 
 def test_elements_and_attributes_with_a_prefix_are_ignored(tmp_path: Path) -> None:
-    body = '<geom size="1" a:b="2" name="{}"/><no:such size="1"><geom size="x"/></no:such>'
+    body = '<no:such size="1"><geom size="x"/></no:such><geom size="1" a:b="2" name="{}"/>'
     model = write_files(
         tmp_path,
         main=scene(body.format("own"), '<include file="more.xml"/>'),

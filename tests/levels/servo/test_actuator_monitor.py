@@ -12,7 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.limits import MAX_CONTACT_FRACTION
+from rack.levels.robot.limits import MAX_CONTACT_FRACTION, MAX_RESTING_CONTACT_FRACTION
 from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell, config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
@@ -174,3 +174,19 @@ def test_a_motor_that_lacks_more_than_a_contact_explains_is_found_while_pressing
     much = (MAX_CONTACT_FRACTION + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
     assert [finding.subject for finding in found] == [1]
+
+
+def test_a_dead_motor_is_found_while_two_joints_turn_although_a_part_is_held() -> None:
+    monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
+    turning = np.array([0.3, 0.0, 0.0, 0.3, 0.0, 0.0])
+    state = np.array([REST, turning])
+    terms = Dynamics(CELL).terms(CELL.home, turning)
+    # Less than contacts may exert while no more than one joint turns.
+    missing = 0.95 * MAX_RESTING_CONTACT_FRACTION * CELL.bounds.torque * [1, 0, 0, 0, 0, 0]
+    dry = np.sign(turning) * CELL.model.dof_frictionloss[CELL.dof]
+    monitor.torque[:] = terms.bias + dry + missing
+    found = []
+    for _ in range(SURE_CYCLES + 2):
+        found.append(monitor.check_cycle(state, state, terms, holds=True))
+        monitor.begin_cycle()
+    assert [finding.subject for finding in found if finding] == [0]

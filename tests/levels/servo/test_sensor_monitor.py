@@ -10,9 +10,11 @@ import pytest
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Arm, SimulatedArm
+from rack.levels.arm.link import Sensed
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell, replace_encoders
-from rack.levels.servo.sensor_monitor import compute_tolerance
+from rack.levels.servo.control import ArmParams
+from rack.levels.servo.sensor_monitor import SensorMonitor, compute_tolerance
 from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo.rig import BRAKES, GOAL, HOME, MOVE, Course, ServoRig, rig_under_way
@@ -82,6 +84,19 @@ def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it
     assert rig.alarms(*BRAKES) == [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED]
     assert rig.status.reason == ""
     assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
+
+
+def test_a_joint_remains_in_doubt_until_its_sensor_changes() -> None:
+    monitor = SensorMonitor(build_cell(*config("puma560"), CLOCK_NS), ArmParams(), 0.0025, 1)
+    rest = np.zeros(6)
+    step = np.full(6, 1e-5)
+    doubts = []
+    for tick, position in enumerate([HOME, HOME + step, HOME + step, HOME]):
+        if tick == 2:
+            monitor.doubt[:] = 1e-3
+        monitor.check_sample(Sensed(position, rest, 0.0, 0.0, tick), tick, None, False)
+        doubts.append(monitor.doubt.max())
+    assert doubts == [0.0, 0.0, 1e-3, 0.0]
 
 
 def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:

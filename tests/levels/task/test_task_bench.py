@@ -114,6 +114,8 @@ def test_a_stalled_task_has_a_reason(plan: list[int], below: dict[str, Any], why
     bench = Bench(HOME, stalled_s=5.0)
     if plan:
         bench.plan(plan)
+    for _ in range(4):  # an operator prevents motion
+        bench.cycle(**below, operated=True)
     for k in range(4):  # the arm moves slowly
         bench.cycle(**below, progress=0.01 * k if plan else 0.0)
     held = "reason" in below

@@ -10,10 +10,12 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.kinds import KINDS
 from rack.levels.level import Demand, Fault, Pace
 from rack.levels.messages import Error
+from rack.levels.operator import Operation
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.messages import EXTENSOR
 from tests.levels.arms import config, context
 from tests.levels.box import mute
+from tests.levels.lockstep import Operator
 from tests.levels.systems.hand.hand_rig import AMPLITUDE_RAD, CLOCK_NS, EVERY, HandRig
 
 MUST = "must be commanded by one board; it is commanded by"
@@ -101,6 +103,18 @@ def test_emergency_stop_closes_the_valves_and_keeps_the_tensions(demand: Demand)
     assert np.abs(status.velocity).max() < 0.5 * np.abs(held.velocity).max()
     assert status.tension.min() > 10.0  # it does not let go
     rig.cycles(20)
+    assert_follows(rig)
+
+
+def test_an_operator_holds_the_hand_with_closed_valves_until_resume() -> None:
+    rig = swinging(())
+    operator = Operator(rig)
+    operator.say("hand", Operation.HOLD)
+    rig.cycles(20)
+    assert rig.executor.hand.braked
+    assert (rig.status.state, rig.status.stopped) == (State.HOLDING, 1)
+    assert rig.status.reason == "held by the operator: valves closed; `resume` opens them"
+    operator.say("hand", Operation.RESUME)
     assert_follows(rig)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import State
 from rack.levels.level import Pace
 from rack.levels.messages import Error
 from rack.levels.robot.cell import compute_sizes
-from rack.levels.systems.joint_boards.gateway import JointGateway
+from rack.levels.systems.joint_boards.gateway import JointGateway, NetworkGatewayParams
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from tests.levels.arms import cell, config, context
 
@@ -125,3 +126,13 @@ def test_the_boards_appear_as_one_after_the_delay() -> None:
     rig.run(10)
     assert (rig.status.stopped, rig.status.state) == (1, State.HOLDING)
     assert rig.status.reason == "no status from 'near': waiting for its board"
+
+
+@pytest.mark.parametrize(
+    ("key", "most", "more"),
+    [("delay", 1.0, 1.01), ("missing", 1000, 1001), ("period", 1.0, 1.01), ("tick", 1.0, 1.01)],
+)
+def test_the_parameters_of_the_link_are_limited(key: str, most: float, more: float) -> None:
+    assert NetworkGatewayParams.model_validate({key: most})
+    with pytest.raises(ValidationError, match=key):
+        NetworkGatewayParams.model_validate({key: more})
