@@ -40,7 +40,7 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Box, HandOver, Run, System
 from rack.boards.run.writing_right import WritingRight
 from tests.backplane.bus import layout, mailbox, task
-from tests.backplane.mailbox.mines import Bomb, MinedBox, mine
+from tests.backplane.mailbox.mines import Bomb, Mined, mine
 from tests.processes import fork, forked, wait_until
 
 BOXES = ("writer.command", "writer.status")
@@ -112,8 +112,8 @@ class Round:
         self._right = WritingRight(segment, spec, self.writers, AlarmWriter(segment, copy))
         for writer in self.writers:
             mine(writer, bomb)
-        self._right.group = MinedBox(self._right.group, bomb)  # type: ignore[assignment]
-        self._right._block = MinedBox(self._right._block, bomb)  # type: ignore[assignment]
+        self._right.group = Mined(self._right.group, bomb)  # type: ignore[assignment]
+        self._right._block = Mined(self._right._block, bomb)  # type: ignore[assignment]
 
     def take_over(self) -> None:
         """Take over and publish."""
