@@ -186,13 +186,13 @@ class Block:
     TRACE_FIRST = 28
     # In lockstep, first of the releases given together with RELEASED. Written by the clock.
     FIRST = 29
-    FAILED = 30  # place in the code where the last process failed, and how often in a row
+    BEGUN_NS = 30  # begin of the job in `COMPUTING_NS`, in simulated ns since tick 0
     # In lockstep, tick at which a cycle that takes simulated time continues, else 0. Set by the
     # task, which then waits, and cleared by the clock.
     FINISH = 31
     SCHEDULER = 32  # Scheduler of an executor, 0 if the rack's config names none
     # In lockstep, processor time in ns of the cycle that waits for the end of its job on a
-    # simulated core. Then the end of the job.
+    # simulated core. Then the end of the job, in simulated ns since tick 0.
     COMPUTING_NS = 33
     # Of a task with standbys, written by the copy that takes over: see `rack.backplane.standby`.
     # Number of the active copy, 0 for the task itself.
@@ -213,7 +213,6 @@ class Block:
     # Of a task with standbys: 1 + number of the copy that has strayed, 0 for none. Written by the
     # copy that has found it, and cleared by the clock.
     STRAYED = 45
-    BEGUN_NS = 46  # begin of that job, in simulated ns since tick 0, like its end in COMPUTING_NS
 
 
 class TaskState(IntEnum):

@@ -25,14 +25,7 @@ from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
 from rack.levels.operator import NAMED_OPERATIONS, Goal, Operation
-from rack.levels.tables import list_live_keys, read_params
-
-
-@dataclass(frozen=True)
-class PublishedParam:
-    """A parameter that an operator may set while its level runs, with its value at the launch."""
-
-    launched: str
+from rack.levels.tables import list_live_keys
 
 
 @dataclass(frozen=True)
@@ -53,7 +46,6 @@ class PublishedLevel:
         wording: Valid names for each command that takes a name. Commands whose names are not known
             are left out.
         names: Names to which the level's alarms refer by index. See `Executor.list_names`.
-        live: Its live parameters by key.
         struck_by: Fault kinds that can affect the hardware that it drives.
         findings: Events that it declares, in the order of their numbers.
     """
@@ -61,9 +53,13 @@ class PublishedLevel:
     commands: Mapping[Operation, tuple[Goal, ...]] = field(default_factory=dict)
     wording: Mapping[Operation, tuple[str, ...]] = field(default_factory=dict)
     names: tuple[str, ...] = ()
-    live: Mapping[str, PublishedParam] = field(default_factory=dict)
     struck_by: tuple[str, ...] = ()
     findings: tuple[PublishedFinding, ...] = ()
+
+    @property
+    def live(self) -> tuple[str, ...]:
+        """Keys of its live parameters."""
+        return self.wording.get(Operation.SET, ())
 
 
 Levels = Mapping[str, PublishedLevel]
@@ -128,14 +124,7 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
     """Return the facts to be published about the level of one board."""
     commands = dict(kind.commands) if has_operator_port(kind) else {}
     params = config.board[board].params
-    live: dict[str, PublishedParam] = {}
-    if kind.params is not None and (keys := list_live_keys(kind.params)):
-        launched = None
-        # Parameters with mistakes have no values here. The rules report the mistakes.
-        with suppress(LevelError):
-            launched = read_params(kind.params, params)
-        live = {key: PublishedParam(str(getattr(launched, key, ""))) for key in keys}
-    wording = {Operation.SET: tuple(live)}
+    wording = {Operation.SET: list_live_keys(kind.params)}
     if names_scheduler(config):
         commands[Operation.SCHEDULE] = ()
         wording[Operation.SCHEDULE] = list_valid_schedulers(config)
@@ -149,7 +138,6 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
         commands={what: tuple(goals) for what, goals in commands.items()},
         wording=wording,
         names=tuple(kind.list_names(params)),
-        live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
         findings=tuple(
             PublishedFinding(finding.name, finding.unit, finding.doc)

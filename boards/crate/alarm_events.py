@@ -25,10 +25,8 @@ from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import format_count
 from rack.boards.faults.describe import describe_fault, find_board, find_subject, format_joint
 from rack.boards.operator import copy_request_message, describe_command, find_level
-from rack.levels.errors import LevelError
 from rack.levels.messages import Error
-from rack.levels.operator import Operation, OperatorCommand
-from rack.levels.tables import read_setting
+from rack.levels.operator import Operation
 
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
 """Reasons why brakes engaged other than errors. Subject -n of an alarm refers to entry n."""
@@ -132,7 +130,7 @@ TEXTS: Mapping[str, Mapping[Alarm, str]] = {
         Alarm.FAULT_ENDS: "{what} ends; acted {times}",
     },
     "command": {
-        Alarm.COMMANDED: "{what}{before} (command {value:.0f})",
+        Alarm.COMMANDED: "{what} (command {value:.0f})",
         Alarm.OPERATOR_GONE: "{what}: its operator is gone: hold (command {value:.0f})",
     },
     "demand": {Alarm.DEMAND: "{what}"},
@@ -176,8 +174,6 @@ class AlarmReader:
         # The cell is built only when the first collision is reported.
         self._geom = str if config.robot is None else partial(find_geom_name, config)
         self._levels = PublishedRack.read_from_segment(segment).levels
-        # Values of live parameters that were set since the launch, by board and key.
-        self._live: dict[tuple[str, str], object] = {}
         self.lost = 0
 
     def read_alarms(self) -> list[ReadAlarm]:
@@ -229,8 +225,6 @@ class AlarmReader:
             if alarm == Alarm.COMMANDED:
                 since = -1
                 code = to_enum(Operation, message.what).name.lower()
-                is_set = message.what == Operation.SET
-                words["before"] = self._format_previous_value(board, message) if is_set else ""
         elif about == "demand":
             demand = to_enum(Demand, value)
             subject = ANOTHER_RACK if number == PEER else self._name_task(number, EMERGENCY_STOP)
@@ -332,21 +326,6 @@ class AlarmReader:
                 return select_item(ENGAGED_BY, -number, "reason to brake")
             case _:
                 return ""
-
-    def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
-        """Return a clause with the value that a parameter had before a command set it.
-
-        Also store the new value, which is the previous value for the next command.
-        """
-        try:
-            key, value = read_setting(command.name)
-        except LevelError:
-            # Another program issued the command without checking it. The level refuses it.
-            return ""
-        param = self._levels[board].live.get(key)
-        before = self._live.get((board, key), param and param.launched)
-        self._live[board, key] = value
-        return f", before {before}"
 
     def _name_task(self, number: int, other: str) -> str:
         """Return the name of a task by its number, or `other` for a negative number."""

@@ -10,7 +10,6 @@ from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
 from socket import socket
-from zlib import crc32
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
@@ -41,11 +40,6 @@ from rack.levels.references import find_class
 
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""
-REPEATS_FACTOR = 1 << 16
-"""Factor that separates the two numbers in the word `Block.FAILED`.
-
-The word is a checksum of the place in the code, times this factor, plus the number of repeats.
-"""
 MAX_TOUCHED_CYCLE_NS = 10_000_000
 """Longest period of a task for which memory is touched in advance, in ns.
 
@@ -74,27 +68,9 @@ def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment]
     except (BackplaneError, LevelError) as error:
         write_line(sys.stderr, f"board '{name}': {error}")
         return UNRECOVERABLE_STATUS if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
-    except Exception as error:
-        write_line(sys.stderr, _describe_failure(segment, name, error))
+    except Exception:
+        write_line(sys.stderr, f"board '{name}' failed:\n{traceback.format_exc().rstrip()}")
         return 1
-
-
-def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
-    """Describe the error that ended a board, with its traceback.
-
-    If the board's previous process ended in the same place in the code, the traceback is replaced
-    by the number of repeats.
-    """
-    if name in segment.map.blocks:
-        block = segment.get_block(name)
-        place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())
-        last_place, repeats = divmod(block[Block.FAILED], REPEATS_FACTOR)
-        repeats = repeats + 1 if place == last_place else 0
-        block[Block.FAILED] = place * REPEATS_FACTOR + repeats
-        if repeats:
-            reason = "".join(traceback.format_exception_only(error)).rstrip()
-            return f"board '{name}' failed again in the same place ({repeats} repeats): {reason}"
-    return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> int:

@@ -108,8 +108,8 @@ def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_value
     assert [answered[tick] for tick in (101, 102, 200, 201)] == [0, 1, 1, 2]
     seen = [event for event in events if event.kind == "command"]
     assert [(e.tick, e.code, e.board, e.text) for e in seen] == [
-        (101, "set", "lower", "set by=3, before 1 (command 1)"),
-        (200, "set", "lower", "set by=2, before 3 (command 2)"),
+        (101, "set", "lower", "set by=3 (command 1)"),
+        (200, "set", "lower", "set by=2 (command 2)"),
     ]
 
 

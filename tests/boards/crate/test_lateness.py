@@ -63,13 +63,9 @@ def test_a_level_that_crashes_in_every_first_cycle_has_skipped_all_and_fails_the
         "level 'wave' missed 0 and skipped 80 of its 80 cycles (100 %; at most 5 % permitted)",
     )
     printed = [event.text for event in events if event.kind == "printed"]
-    assert sum(text.startswith("Traceback") for text in printed) == 1
     died = sum(event.kind == "died" for event in events)
-    again = [text for text in printed if "in the same place" in text]
-    assert died - len(again) in (1, 2)  # the last one may not have been read
-    assert again[1] == (
-        "board 'wave' failed again in the same place (2 repeats): RuntimeError: no cycle at all"
-    )
+    # The last one may not have been read.
+    assert died - printed.count("RuntimeError: no cycle at all") in (0, 1)
 
 
 @pytest.mark.slow
