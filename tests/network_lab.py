@@ -20,6 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
+from rack.backplane.process import wait_readable
 from rack.tools.console.answer import Failure
 from tests.processes import parent_of
 
@@ -199,7 +200,7 @@ def _end(names: Sequence[str]) -> None:
                 with suppress(ProcessLookupError):
                     os.kill(pid, how)
             struck |= roots
-            time.sleep(0.02)
+            _await_end(next(iter(inside)))
 
 
 def _inside(names: Sequence[str]) -> dict[int, int]:
@@ -213,3 +214,15 @@ def _inside(names: Sequence[str]) -> dict[int, int]:
             with suppress(OSError):
                 found[pid] = parent_of(pid)
     return found
+
+
+def _await_end(pid: int) -> None:
+    """Wait a little for the end of a process."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    try:
+        wait_readable(pidfd, 0.1)
+    finally:
+        os.close(pidfd)
