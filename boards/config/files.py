@@ -271,8 +271,7 @@ def _read_config(
             why = f"the chain of extended files is longer than {MAX_DEPTH} files"
         if why:
             raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
-        # A file without a format has format 1, even if it extends files of a newer format.
-        top = {"format": 1, **resolve_paths(_read_tables(path), path.parent)}
+        top = resolve_paths(_read_tables(path), path.parent)
         merged: Tables = {}
         for base in _list_bases(top.pop("extends", []), path, mistakes):
             merged = _merge_extension(merged, _read_config(base, (*chain, path), known, mistakes))

@@ -60,13 +60,6 @@ Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
 Restarts = Annotated[int, Field(ge=0, le=10_000)]
-FORMAT = 2
-"""Newest format of configs, used since rack 0.2."""
-FORMAT_NOTE = (
-    'config format 1, from before rack 0.2: since then clock.idle_cores is "sleep" unless it is'
-    " given, and classes of levels have moved (old names still work); write format = 2 when"
-    " that suits you"
-)
 RESTART_S = 2.0
 """Longest time of a restart in real time. A planner with its libraries needs 1.5 s."""
 LONGEST_EVERY = 1_000_000
@@ -341,9 +334,8 @@ class TaskEntry(NamedTuple):
 class RackConfig(Table):
     """Config of a rack: everything that a run depends on."""
 
-    format: int = Field(1, ge=1, le=FORMAT)
-    """format of this config; 2 is described on this page; 1 is from before rack 0.2, and a launch
-    notes the differences"""
+    format: int = Field(2, ge=1, le=2)
+    """format of this config; 1, from before rack 0.2, is read like 2"""
     name: RackName
     """name of the rack and of its shared memory: at most 40 of a-z, 0-9, - and _"""
     seed: int = Field(0, ge=0, le=2**31 - 1)
@@ -385,11 +377,6 @@ class RackConfig(Table):
         if self.adapter.lan is not None and LAN not in self.board:
             self.board[LAN] = self.adapter.lan.build_board()
         return self
-
-    @property
-    def format_notes(self) -> list[str]:
-        """Notes on changes since this config's format. Empty if the format is the newest."""
-        return [FORMAT_NOTE] if self.format < FORMAT else []
 
     @property
     def is_lockstep(self) -> bool:

@@ -83,7 +83,6 @@ def reserve_cores(plan: Resolved, segment: Segment) -> Iterator[str]:
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
     """Yield notes on refused priorities and other limits of this machine."""
     config = plan.config
-    yield from config.format_notes
     if (network := load_network_rules(config)) is not None:
         yield from network.list_network_notes(config)
     if config.is_lockstep:

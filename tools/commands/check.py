@@ -137,8 +137,7 @@ def check(
         verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": repair}
         timing = forecast.to_document() | verdict
         arm_document = None if arm is None else asdict(arm)
-        extra = {"changed": rack_config.format_notes, "arm": arm_document}
-        print_json(inventory_document | extra | {"timing": timing})
+        print_json(inventory_document | {"arm": arm_document, "timing": timing})
     else:
         arguments_text = shlex.join([config, *(f"--set={setting}" for setting in settings)])
         measured = choose_run_folder(None, rack_config.name)
@@ -150,7 +149,6 @@ def check(
         lines: list[str | TextTable] = [
             *format_verdict(forecast, () if run else measuring),
             head,
-            *rack_config.format_notes,
             *core_warnings,
             *format_summary(forecast, arm, rack_config.joints),
             *format_fixes(fixes, fitting.end.failures),

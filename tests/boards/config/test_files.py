@@ -20,10 +20,9 @@ Write = Callable[[str, str], Path]
 
 
 @pytest.mark.parametrize("name", list_names())
-def test_every_bundled_config_survives_as_text_and_is_of_the_newest_format(name: str) -> None:
+def test_every_bundled_config_survives_as_text(name: str) -> None:
     config = load(name)
     assert load_text(config.to_toml_text()) == config
-    assert config.format_notes == []
     assert (
         list_level_classes(assemble(name, (), None).tables) == build_preload_request(config).classes
     )
@@ -66,20 +65,6 @@ def test_other_racks_in_the_folder_of_a_bundled_one_have_names_too(
 
 def test_an_unknown_name_gets_the_nearest_known_one() -> None:
     assert find_mistake("nasrm") == "config = \"nasrm\": no such file; did you mean 'nasrem'?"
-
-
-def test_the_format_of_a_file_does_not_depend_on_the_files_it_extends(
-    small: Path, write: Write
-) -> None:
-    older = load(write("older.toml", 'name = "mine"\nextends = ["small.toml"]\n'))
-    newer = load(write("newer.toml", 'format = 2\nname = "mine"\nextends = ["older.toml"]\n'))
-    assert (load(small).format, older.format, newer.format) == (2, 1, 2)
-    assert load_text(older.to_toml_text()).format == 1
-    assert newer.format_notes == []
-    (line,) = older.format_notes
-    assert line.startswith("config format 1, from before rack 0.2: since then ")
-    assert line.endswith("write format = 2 when that suits you")
-    assert "\n" not in line
 
 
 @pytest.mark.parametrize("given", ["0", "3", "2.0", "'2'", "true"])
