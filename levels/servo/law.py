@@ -133,7 +133,8 @@ class ServoLaw(ArmDriver):
 
     def take_messages(self) -> None:
         """Process the new messages of this cycle: operator's command, plan and set point."""
-        self.operator_control.take_commands(self.operator, self.sensors.position)
+        if self.operator.is_new:
+            self.operator_control.take_commands(self.operator, self.sensors.position)
         if self.plan.is_new:
             self.take_plan(self.plan.message)
         if self.above.is_new:

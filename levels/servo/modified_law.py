@@ -181,7 +181,7 @@ class ModifiedLaw:
             self._difference[:] = self._last - torque
         if self._since is not None:
             torque = self._blend_torque(torque, tick - self._since)
-        np.clip(torque, -self._torque, self._torque, out=self._last)  # keeps NaN
+        np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # keeps NaN
         self._is_driving = True
         return self._last
 

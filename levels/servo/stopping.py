@@ -180,6 +180,12 @@ class Stopping:
             self.cause = Error.NONE
         if self.error:
             return Reaction.BRAKE
+        is_sound = self.refused is None and self._retry_at is None and self._struck_until is None
+        if is_sound and not (sensors.faulty or demand):
+            self._fault_ticks = max(self._fault_ticks - passed, 0)
+            self.cause = Error.NONE
+            self.reason = ""
+            return Reaction.NONE
         reaction, cause = self._select_reaction(sensors, tick)
         if cause is None:
             self._fault_ticks = max(self._fault_ticks - passed, 0)
