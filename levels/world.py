@@ -105,7 +105,8 @@ class WorldModel(Executor):
 
 def compute_distances(poses: Array, others: Array) -> Array:
     """Return the distance in m between each pair of corresponding poses; both are (bodies, 7)."""
-    return np.asarray(np.linalg.norm((poses - others)[:, :3], axis=1))
+    x, y, z = (poses - others)[:, :3].T
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def compute_angles(poses: Array, others: Array) -> Array:
