@@ -180,7 +180,8 @@ def reserve_time(reservation: Reservation, pid: int = 0) -> str:
     if _libc.syscall(_SCHED_SETATTR, pid, attributes, 0) == 0:
         return ""
     code = ctypes.get_errno()
-    return os.strerror(code) + f"; {PERMITS_RESERVATIONS}" * (code == errno.EPERM)
+    why = os.strerror(code)
+    return f"{why}; {PERMITS_RESERVATIONS}" if code == errno.EPERM else why
 
 
 PERMITS_RESERVATIONS = (

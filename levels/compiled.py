@@ -73,7 +73,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         return self._machine
 
     def _build(self) -> Any:
-        """Return numba's version of this function, which calls that of other marked functions."""
+        """Return this function compiled by numba, with calls to compiled forms of others."""
         from numba import config, njit
 
         # NUMBA_DISABLE_JIT is meant for users' functions. These functions need compilation, because

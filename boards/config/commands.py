@@ -244,9 +244,9 @@ def _check_setting(
     except LevelError as error:
         yield Mistake(name, command.name, str(error))
         return
-    if key not in level.live:
+    if key not in level.live_keys:
         params = name if place else f"board.{command.level}.params"
-        why = f"not a live parameter; live parameters: {', '.join(level.live) or 'none'}"
+        why = f"not a live parameter; live parameters: {', '.join(level.live_keys) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
     elif place and (kind := find_executors(config)[command.level].params) is not None:
         table = {**config.board[command.level].params, key: value}

@@ -57,7 +57,7 @@ class PublishedLevel:
     findings: tuple[PublishedFinding, ...] = ()
 
     @property
-    def live(self) -> tuple[str, ...]:
+    def live_keys(self) -> tuple[str, ...]:
         """Keys of its live parameters."""
         return self.wording.get(Operation.SET, ())
 

@@ -109,7 +109,7 @@ class Task(ABC):
                     # Faults extend the computing before any other step.
                     extend = faults.extend_computing
                     others = [step for step in self.simulated.steps if step != extend]
-                    self.simulated.steps = [extend] * bool(faults.loads) + others
+                    self.simulated.steps = [extend, *others] if faults.loads else others
                     late_ticks = faults.find_lateness(tick)
                     late_ns = int(late_ticks * self.clock.period_ns)
                     self.simulated.late_ns = self.stopwatch.late_ns = late_ns

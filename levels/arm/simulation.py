@@ -138,10 +138,13 @@ class Simulation(Plant):
             option.timestep = step_s
 
     def _finish_failed_tick(self, steps_made: int) -> None:
-        """Complete a tick in which step -`steps_made` failed a check.
+        """Complete a tick in which a step failed a check.
 
         The remaining steps are made, and contacts and violated limits are counted and reported. If
         the simulation itself has failed, the state before the tick is restored instead.
+
+        Args:
+            steps_made: Number of steps made so far, negated, as `make_steps` returns it.
         """
         touches = self.touches
         while steps_made < 0:

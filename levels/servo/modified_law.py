@@ -218,6 +218,7 @@ class ModifiedLaw:
             [state for state in active if state.modification.hook == hook] for hook in Hook
         )
         self._switched = True
-        failed = [f"modification '{name}' taken out: {why}" for name, why in self._failed.items()]
-        names = ", ".join(state.name for state in active)
-        self.reason = "; ".join(failed + [f"modified by {names}"] * bool(names))
+        parts = [f"modification '{name}' taken out: {why}" for name, why in self._failed.items()]
+        if active:
+            parts.append(f"modified by {', '.join(state.name for state in active)}")
+        self.reason = "; ".join(parts)

@@ -30,8 +30,8 @@ class OperatorControl:
     Attributes:
         orders: Commands of the operator and the answers to them.
         is_in_control: True if the level follows the operator instead of the level above.
-        return_path: Positions from which the operator moved the arm, oldest first, (joints,) each,
-            rad. Without them, motion continues from the present position.
+        return_path: Positions at which the operator took the arm over, (joints,) each, rad, oldest
+            first. The arm returns through them. If empty, it continues from where it is.
     """
 
     def __init__(

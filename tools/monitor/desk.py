@@ -175,7 +175,7 @@ class LevelCommander:
         """
         place, _, _ = setting.partition("=")[0].rpartition(".")
         live = {
-            name: published.live
+            name: published.live_keys
             for name, published in self._levels.items()
             if Operation.SET in published.commands
         }
