@@ -6,7 +6,7 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 
@@ -68,8 +68,8 @@ class Held(AtTick):
     """Strikes while a rack in lockstep, launched with `step`, is held at the tick.
 
     The run cannot end before the strike, however late a busy machine lets the display look.
-    Afterwards the rack continues. With `run`, the folder of the run, it also waits for first rows
-    on the disk.
+    Afterwards the rack continues. With `is_ready` it also waits until that returns True, such as
+    for a file that the recorder makes later.
     """
 
     def __init__(
@@ -78,16 +78,15 @@ class Held(AtTick):
         number: signal.Signals,
         tick: int = FIRST_BLOCK,
         times: int = 1,
-        run: Path | None = None,
+        is_ready: Callable[[], bool] = lambda: True,
     ) -> None:
         super().__init__(number, -1, times=times)
-        self._rack, self._hold_at, self._run = rack, tick + 1, run
+        self._rack, self._hold_at, self._is_ready = rack, tick + 1, is_ready
 
     def show(self, snapshot: Snapshot) -> None:
         """Let the rack run to the tick, and strike there."""
         with closing(Segment.attach(self._rack)) as segment:
-            has_rows = self._run is None or has_spooled(self._run, 1)
-            if segment.words[System.HELD] == self._hold_at and has_rows:
+            if segment.words[System.HELD] == self._hold_at and self._is_ready():
                 super().show(snapshot)
             is_done = len(self.struck) == self._times
             segment.words[System.HOLD_AT] = 0 if is_done else self._hold_at

@@ -30,7 +30,15 @@ from rack.tools.recording.spool import Spool, try_lock
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import write_report
 from tests.tools.analysis_text import text as analysis_text
-from tests.tools.recording.struck_recorders import LONG_S, AtTick, Held, counts, notes_of, realtime
+from tests.tools.recording.struck_recorders import (
+    LONG_S,
+    AtTick,
+    Held,
+    counts,
+    has_spooled,
+    notes_of,
+    realtime,
+)
 
 pytestmark = pytest.mark.thorough
 
@@ -40,7 +48,9 @@ WATCHDOG_S = 60.0
 def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = Held(config.name, signal.SIGKILL)
+    # The viewer's library takes its time to open its file.
+    has_view = (tmp_path / "run" / "run.rrd").is_file
+    display = Held(config.name, signal.SIGKILL, is_ready=has_view)
     result = run_rack(config, LONG_S / 2, tmp_path / "run", display, step=True)
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
@@ -119,7 +129,7 @@ def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
     times, run = recorder_process.MAX_RESTARTS + 1, tmp_path / "run"
-    display = Held(config.name, signal.SIGKILL, times=times, run=run)
+    display = Held(config.name, signal.SIGKILL, times=times, is_ready=lambda: has_spooled(run, 1))
     result = run_rack(config, LONG_S, run, display, step=True)
     assert len(display.struck) == times
     assert (result.outcome.is_success, result.worked) == (True, False)
