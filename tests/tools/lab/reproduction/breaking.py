@@ -14,7 +14,7 @@ CHAIN = "chain"
 
 
 class BreakingWorkshop(Workshop):
-    """Workshop that runs changed racks, each for at most `most_s`.
+    """Workshop that runs changed racks, each for at most `most_s` if that is given.
 
     `changes` are TOML texts by the name of the rack. `scripts` are TOML texts that replace fault
     scripts by name.
@@ -24,7 +24,7 @@ class BreakingWorkshop(Workshop):
         self,
         folder: Path,
         changes: Mapping[str, str],
-        most_s: float,
+        most_s: float | None,
         scripts: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(folder, share=True)
@@ -61,7 +61,8 @@ class BreakingWorkshop(Workshop):
 
     def run(self, label: str, config: RackConfig, seconds: float | None = None) -> ObservedRun:
         """Run a rack for no longer than permitted."""
-        return super().run(label, config, min(seconds or self._most_s, self._most_s))
+        limits = [limit for limit in (seconds, self._most_s) if limit is not None]
+        return super().run(label, config, min(limits, default=None))
 
     def _written(self, name: str, text: str) -> str:
         path = self.folder / f"broken-{name.replace('/', '-')}.toml"

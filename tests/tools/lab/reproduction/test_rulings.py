@@ -49,7 +49,7 @@ LATE = {"kind": "overrun", "by": 1.2, **LONG}
 """Every other cycle is skipped."""
 LOCKSTEP = "\n" + to_toml({"clock": {"mode": "lockstep"}})
 SYSTEM_CLAIMS = ("brown", "chimera", "condor", "hic", "ibm", "penn", "rccl")
-WHOLE_TASK_S = 60.0
+TASKS_S = {**tasks.TASKS_S, "brown": tasks.BROWN_S}
 LATE_BOARD = fault(board="board2", at=0.1, **LATE)
 DELAYED = {"kind": "delay", "at": 0.5, **LONG}
 SLOW_BUS = "[board.servo.transfer]\nread_ms = 0.5\nwrite_ms = 0.5\n"
@@ -268,12 +268,15 @@ def test_claims_do_not_hold_in_a_rack_that_breaks_them(
 @pytest.mark.parametrize("name", SYSTEM_CLAIMS)
 def test_claims_on_a_system_hold_in_its_whole_task(name: str, tmp_path: Path) -> None:
     changes = dict.fromkeys((name, f"{name}/servo"), LOCKSTEP)
-    workshop = BreakingWorkshop(tmp_path, changes, WHOLE_TASK_S)
+    workshop = BreakingWorkshop(tmp_path, changes, most_s=None)
     verdict = by_experiments(workshop, CLAIMS[name])
     unmet = {check.compared for check in verdict.checks if not check.met}
     # Most machines have fewer cores than the arm has joints.
     assert unmet <= {"processors_of_joints"}
     assert verdict.ruling is (Ruling.BOUNDED if unmet else Ruling.HOLDS)
+    # A run ends with its task.
+    found = FOUND[tasks.TASKS[name].name, workshop.about]
+    assert found.lasted_s == pytest.approx(TASKS_S[name], rel=0.01)
 
 
 def test_every_ruling_of_the_page_can_fail() -> None:

@@ -52,11 +52,6 @@ SMALL_S = 3.0
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
-TIMEOUT_FACTOR = 2.0
-"""Multiple of its expected time after which a task is ended.
-
-A machine that is too slow may never finish it.
-"""
 MAX_ATTEMPTS = 3
 LAUNCH_S = 3.0
 EXTRA_DELAY_MS = 100
@@ -158,7 +153,7 @@ class NetworkRun(TaskRun):
 def _measure_task(name: str, workshop: Workshop) -> TaskRun:
     """Run the whole task of a system in real time."""
     label = f"task-{name.replace('/', '-')}"
-    run = workshop.run(label, workshop.load_config(name), TIMEOUT_FACTOR * TASKS_S[name])
+    run = workshop.run(label, workshop.load_config(name))
     return replace(summarize_task(*run), mechanism=measure_mechanism(name, run.recording))
 
 
