@@ -30,10 +30,14 @@ from two_levels import Upper
 class Stalling(Upper):
     def self_test(self):
         folder = Path(os.environ["CAMPAIGN"])
-        if (folder / "trials" / "nominal.json").exists():
+        launched = folder / f"launched-{os.getppid()}"
+        if launched.exists():
             (folder / f"stalls-{os.getpid()}").touch()
             time.sleep(600)
+        launched.touch()
 """
+"""Stalls every launch of a crate but the first: that of the faultless rack, which each worker runs
+before its trials."""
 
 
 LOCKSTEP = ("--lockstep", "--injections", "2", "--seed", "4", "--seconds", "9", "--json")
