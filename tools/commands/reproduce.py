@@ -46,7 +46,7 @@ def reproduce(
     claim cannot be observed, such as one in which a level made no plan, counts neither for nor
     against it.
 
-    The experiments take fifteen minutes on two cores. Do not use the machine during this time,
+    The experiments take eleven minutes on two cores. Do not use the machine during this time,
     because other load distorts the real-time figures. Finished experiments are kept, even if the
     command is interrupted or killed; the same command continues. After a change of configs, program
     or machine the experiments that depend on it are repeated. To repeat others, choose another DIR.
