@@ -31,7 +31,11 @@ MIN_TURNING_SPEED = 5.0 * FRICTION_SPEED
 
 
 class FaultyLink:
-    """Implements `Link`, and applies the injected faults to samples, torques and set points."""
+    """Implements `Link`, and applies the injected faults to samples, torques and set points.
+
+    Attributes:
+        faultless: The link to which this one passes torques and set points on.
+    """
 
     def __init__(
         self,
@@ -51,7 +55,7 @@ class FaultyLink:
         cell = arm.cell
         self._arm = arm
         self._holds = holds
-        self._next = link
+        self.faultless = link
         self._effects = acted
         self._limits = limits = cell.bounds.torque
         # Friction may change from helping to resisting, and so hide twice its value.
@@ -87,7 +91,7 @@ class FaultyLink:
 
     def sense(self) -> Sensed:
         """Return the newest sample with the faults applied."""
-        sample = self._next.sense()
+        sample = self.faultless.sense()
         for step, active in self._sensors:
             sample, must_be_found = step.act(sample, active)
             if must_be_found is not None:
@@ -98,7 +102,7 @@ class FaultyLink:
         """Pass on torques with the faults applied."""
         if self._commands:
             torque = self._corrupt_torque(torque)
-        finding = self._next.drive(torque, grip_force)
+        finding = self.faultless.drive(torque, grip_force)
         self._record_motor_faults()
         return finding
 
@@ -106,7 +110,7 @@ class FaultyLink:
         """Pass on set points, with command faults applied to the predicted torque."""
         if self._commands:
             target = target._replace(torque=self._corrupt_torque(target.torque))
-        finding = self._next.follow(target, grip_force)
+        finding = self.faultless.follow(target, grip_force)
         self._record_motor_faults()
         return finding
 

@@ -123,10 +123,11 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = compute_push_force(pushes, self._now_s)
-        option = self._model.opt
-        step_s = option.timestep
+        usual_step_s: float | None = None
         if self.late_s != self._shift_s:
             # While the lateness of the clock changes, a tick is longer or shorter.
+            option = self._model.opt
+            usual_step_s = option.timestep
             option.timestep += (self.late_s - self._shift_s) / len(self._steps.seen)
             self._shift_s = self.late_s
         steps_made = self._advance(0, self._tick_end_s, *self._steps)
@@ -134,8 +135,8 @@ class Simulation(Plant):
             self._finish_failed_tick(steps_made)
         elif self.struck:
             self.struck -= 1
-        if option.timestep != step_s:
-            option.timestep = step_s
+        if usual_step_s is not None:
+            self._model.opt.timestep = usual_step_s
 
     def _finish_failed_tick(self, steps_made: int) -> None:
         """Complete a tick in which a step failed a check.

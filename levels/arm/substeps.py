@@ -95,7 +95,9 @@ def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -
         state: Receives the state, (state_size,).
     """
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
-    state[len(state) - len(asleep) :] = asleep
+    first = len(state) - len(asleep)
+    for tree in range(len(asleep)):
+        state[first + tree] = asleep[tree]
 
 
 @compiled_for(

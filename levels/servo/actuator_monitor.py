@@ -293,5 +293,6 @@ def compute_residuals(
         motor["earlier_velocity"] = motor["velocity"]
         motor["velocity"] = velocity[j]
         motor["bias"] = bias[j]
-    inertia_before[:] = inertia
+        for k in range(len(motors)):
+            inertia_before[j, k] = inertia[j, k]
     return verdict

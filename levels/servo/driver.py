@@ -23,6 +23,7 @@ from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DriveState, Sensed, find_arm, preload
+from rack.levels.arm.link import Link
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -101,9 +102,10 @@ class ArmDriver(Executor):
         self.cell = cell
         self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.speed_scale = robot.bring_up or 1.0  # reduced until the operator's release
-        self._link = self.arm.connect(
+        self._faulty_link = self.arm.connect(
             context.tick_s, self.speed_scale, self.acted, lambda: self.holds_part
         )
+        self._link: Link = self._faulty_link.faultless
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
@@ -173,7 +175,8 @@ class ArmDriver(Executor):
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults that are injected between this level and the arm."""
-        self._link.inject(faults)
+        self._faulty_link.inject(faults)
+        self._link = self._faulty_link if faults else self._faulty_link.faultless
 
     @abstractmethod
     def take_messages(self) -> None:
