@@ -34,7 +34,7 @@ class FaultyLink:
     """Implements `Link`, and applies the injected faults to samples, torques and set points.
 
     Attributes:
-        faultless: The link to which this one passes torques and set points on.
+        faultless: The same link to the arm without injected faults.
     """
 
     def __init__(

@@ -139,7 +139,7 @@ class Simulation(Plant):
             self._model.opt.timestep = usual_step_s
 
     def _finish_failed_tick(self, steps_made: int) -> None:
-        """Complete a tick in which a step failed a check.
+        """Finish a tick after one of its steps has failed a check.
 
         The remaining steps are made, and contacts and violated limits are counted and reported. If
         the simulation itself has failed, the state before the tick is restored instead.
